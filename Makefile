@@ -1,0 +1,35 @@
+# make run    set up, then train handkerchief flipping with two actors over an embedded router
+# make test   set up, then run the tests
+# make check  set up, then everything that CI holds: format, lint, types, imports, tests
+
+PYTHON ?= python3.11
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: run test check bench clean
+
+run: $(READY)
+	$(BIN)/clothbus run handkerchief-quickstart --actors 2
+
+test: $(READY)
+	$(BIN)/pytest
+
+check: $(READY)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(MAKE) test
+
+bench: $(READY)
+	$(BIN)/pytest tests/benchmarks --override-ini addopts= -s
+
+# torch by itself first and exactly: a plain "torch" would bring gigabytes of CUDA libraries.
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $(READY)
+
+clean:
+	rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

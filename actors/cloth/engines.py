@@ -1,0 +1,46 @@
+"""The cloth engines by name."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from actors.cloth.engine import ClothEngine
+from actors.cloth.pybullet_process import PyBulletProcessEngine
+from actors.cloth.pybullet_settings import PyBulletSettings
+
+Settings = Mapping[str, Any]
+
+
+def make_engine(name: str, settings: Settings | None = None) -> ClothEngine:
+    """The engine of a name, not yet reset.
+
+    Args:
+        name: a key of `ENGINES`.
+        settings: the engine's own settings by name, where they differ from its defaults.
+
+    Raises:
+        ValueError: there is no such engine, or it has no such setting, or a setting is out of
+            its rule.
+    """
+    if name not in ENGINES:
+        raise ValueError(
+            f"engine: expected one of {', '.join(sorted(ENGINES))}; got {name!r}; name one of them"
+        )
+    return ENGINES[name](settings or {})
+
+
+def _pybullet(settings: Settings) -> ClothEngine:
+    _check_names("pybullet", settings, PyBulletSettings.__dataclass_fields__)
+    return PyBulletProcessEngine(PyBulletSettings(**settings))
+
+
+def _check_names(engine: str, settings: Settings, known: Mapping[str, object]) -> None:
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise ValueError(
+            f"engine settings of {engine}: expected some of {', '.join(known)}; got "
+            f"{', '.join(unknown)}; leave out what this engine lacks"
+        )
+
+
+ENGINES: dict[str, Callable[[Settings], ClothEngine]] = {"pybullet": _pybullet}
+"""Each engine's maker, from its settings."""

@@ -1,0 +1,185 @@
+"""The reference engine: PyBullet's deformable cloth, which meets itself as well as the table."""
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.engine import (
+    TABLE_HALF_WIDTH_M,
+    ClothEngineError,
+    checked_vertices,
+)
+from actors.cloth.gripper import (
+    GripperMotion,
+    check_drop,
+    check_grasp,
+    gripper_path_in_world,
+)
+from actors.cloth.meshes import ClothMesh, write_obj
+from actors.cloth.pybullet_settings import PyBulletSettings
+from actors.cloth.quiet_pybullet import pybullet
+
+TABLE_THICKNESS_M = 0.1
+SETTLE_AFTER_RESET_SECS = 0.05
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass
+class PyBulletEngine:
+    """Cloth in a PyBullet world of its own, in this process, without a window.
+
+    It cannot save and restore a state. Nor does `reset` make it repeat itself: the order in which
+    PyBullet lets the cloth's layers push each other follows a random sequence that belongs to the
+    process and is never rewound. `PyBulletProcessEngine` repeats itself.
+    """
+
+    settings: PyBulletSettings = field(default_factory=PyBulletSettings)
+    motion: GripperMotion = field(default_factory=GripperMotion)
+
+    def __post_init__(self) -> None:
+        """Begin without a world; `reset` makes it."""
+        self._client: int | None = None
+        self._cloth = -1
+        self._mesh: ClothMesh | None = None
+
+    @property
+    def mesh(self) -> ClothMesh:
+        """The cloth at rest.
+
+        Raises:
+            ClothEngineError: before the first reset.
+        """
+        if self._mesh is None:
+            raise ClothEngineError(
+                "PyBulletEngine: expected reset() first; got no cloth; call reset(mesh)"
+            )
+        return self._mesh
+
+    def reset(self, mesh: ClothMesh, vertices_in_world: NDArray[np.float64] | None = None) -> None:
+        """Put a new piece of cloth on an empty table; see `ClothEngine.reset`."""
+        vertices = checked_vertices(mesh, vertices_in_world)
+        # PyBullet lays the cloth's middle surface a margin above whatever it touches.
+        vertices[:, 2] += self.settings.collision_margin_m
+        self._empty_world()
+        self._add_table()
+        self._cloth = self._load(mesh)
+        self._mesh = mesh
+        pybullet.resetMeshData(self._cloth, vertices.tolist(), physicsClientId=self._client)
+        self._simulate(SETTLE_AFTER_RESET_SECS)
+
+    def vertices_in_world(self) -> NDArray[np.float64]:
+        """Where the vertices are, f64[V, 3], metres; see `ClothEngine.vertices_in_world`."""
+        n_vertices = len(self.mesh.vertices_m)
+        _, vertices = pybullet.getMeshData(
+            self._cloth,
+            -1,
+            flags=pybullet.MESH_DATA_SIMULATION_MESH,
+            physicsClientId=self._client,
+        )
+        array = np.array(vertices, dtype=np.float64)
+        if array.shape != (n_vertices, 3):
+            raise ClothEngineError(
+                f"PyBulletEngine: expected {n_vertices} vertices from PyBullet; got "
+                f"{list(array.shape)}; another PyBullet than the pinned one merges vertices"
+            )
+        return array
+
+    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
+        """Carry some vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
+        check_grasp(grasped, len(self.mesh.vertices_m))
+        check_drop(drop_xy_m)
+        start = self.vertices_in_world()[grasped[0]]
+        path = gripper_path_in_world(start, drop_xy_m, self.motion, self.settings.time_step_secs)
+        with self._grasp(grasped, start) as gripper:
+            for position in path:
+                pybullet.resetBasePositionAndOrientation(
+                    gripper, position.tolist(), _UPRIGHT, physicsClientId=self._client
+                )
+                pybullet.stepSimulation(physicsClientId=self._client)
+        self._simulate(self.motion.settle_secs)
+
+    def close(self) -> None:
+        """Give the world back; may be called twice."""
+        if self._client is not None:
+            pybullet.disconnect(physicsClientId=self._client)
+        self._client = None
+        self._mesh = None
+
+    def _empty_world(self) -> None:
+        if self._client is None:
+            self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
+            self._client = None
+            raise ClothEngineError(
+                "PyBulletEngine: expected a physics client; got none; close engines you no longer "
+                "use, PyBullet allows about a thousand in a process"
+            )
+        client = self._client
+        pybullet.resetSimulation(pybullet.RESET_USE_DEFORMABLE_WORLD, physicsClientId=client)
+        pybullet.setGravity(0.0, 0.0, -9.8, physicsClientId=client)
+        pybullet.setTimeStep(self.settings.time_step_secs, physicsClientId=client)
+
+    def _add_table(self) -> None:
+        # A box: over PyBullet's infinite plane the cloth came to rest 4.6 cm too high.
+        half_extents_m = [TABLE_HALF_WIDTH_M, TABLE_HALF_WIDTH_M, TABLE_THICKNESS_M / 2]
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_BOX, halfExtents=half_extents_m, physicsClientId=self._client
+        )
+        table = pybullet.createMultiBody(
+            0, shape, -1, [0.0, 0.0, -TABLE_THICKNESS_M / 2], physicsClientId=self._client
+        )
+        pybullet.changeDynamics(table, -1, lateralFriction=1.0, physicsClientId=self._client)
+
+    def _load(self, mesh: ClothMesh) -> int:
+        settings = self.settings
+        with tempfile.TemporaryDirectory(prefix="clothbus-") as folder:
+            path = Path(folder) / "cloth.obj"
+            write_obj(mesh, path)
+            return int(
+                pybullet.loadSoftBody(
+                    str(path),
+                    mass=settings.mass_kg,
+                    useMassSpring=1,
+                    useBendingSprings=1,
+                    useNeoHookean=0,
+                    springElasticStiffness=settings.elastic_stiffness,
+                    springDampingStiffness=settings.damping_stiffness,
+                    springDampingAllDirections=0,
+                    springBendingStiffness=settings.bending_stiffness,
+                    useSelfCollision=1,
+                    frictionCoeff=settings.friction,
+                    useFaceContact=1,
+                    collisionMargin=settings.collision_margin_m,
+                    physicsClientId=self._client,
+                )
+            )
+
+    @contextmanager
+    def _grasp(self, grasped: NDArray[np.int64], start: NDArray[np.float64]) -> Iterator[int]:
+        """A body without mass that holds the vertices, and lets go of them whatever happens."""
+        client = self._client
+        gripper = pybullet.createMultiBody(
+            0, -1, -1, basePosition=start.tolist(), physicsClientId=client
+        )
+        anchors: list[int] = []
+        try:
+            for vertex in grasped.tolist():
+                anchors.append(
+                    pybullet.createSoftBodyAnchor(
+                        self._cloth, vertex, gripper, -1, physicsClientId=client
+                    )
+                )
+            yield gripper
+        finally:
+            for anchor in anchors:
+                pybullet.removeConstraint(anchor, physicsClientId=client)
+            pybullet.removeBody(gripper, physicsClientId=client)
+
+    def _simulate(self, duration_secs: float) -> None:
+        for _ in range(round(duration_secs / self.settings.time_step_secs)):
+            pybullet.stepSimulation(physicsClientId=self._client)

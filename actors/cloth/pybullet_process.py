@@ -1,0 +1,158 @@
+"""PyBullet in a process of its own, a fresh one at each reset.
+
+Two things are gained for about a quarter of a second at each reset. The cloth repeats itself bit
+by bit, although PyBullet keeps a random sequence that nothing rewinds but a new process. And a
+simulator that crashes or hangs takes nothing with it.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.engine import ClothEngineError, checked_vertices
+from actors.cloth.frames import read_frame, write_frame
+from actors.cloth.gripper import GripperMotion, check_drop, check_grasp
+from actors.cloth.meshes import ClothMesh
+from actors.cloth.pybullet_settings import PyBulletSettings
+
+REPLY_TIMEOUT_SECS = 120.0  # an action takes half a second; a crowded machine, some seconds
+_PACKAGES = Path(__file__).resolve().parents[2]
+
+
+@dataclass
+class PyBulletProcessEngine:
+    """A `ClothEngine`: the cloth of `PyBulletEngine`, exactly repeatable and out of harm's way.
+
+    The same mesh, vertices and sequence of grasps and drops give the same vertices, bit by bit,
+    in every process on one type of CPU. It cannot save and restore a state.
+    """
+
+    settings: PyBulletSettings = field(default_factory=PyBulletSettings)
+    motion: GripperMotion = field(default_factory=GripperMotion)
+    reply_timeout_secs: float = REPLY_TIMEOUT_SECS
+
+    def __post_init__(self) -> None:
+        """Begin without a process; `reset` starts it."""
+        self._worker: subprocess.Popen[bytes] | None = None
+        self._complaints: IO[bytes] | None = None
+        self._mesh: ClothMesh | None = None
+        self._vertices = np.empty((0, 3))
+
+    @property
+    def mesh(self) -> ClothMesh:
+        """The cloth at rest.
+
+        Raises:
+            ClothEngineError: before the first reset.
+        """
+        if self._mesh is None:
+            raise ClothEngineError(
+                "PyBulletProcessEngine: expected reset() first; got no cloth; call reset(mesh)"
+            )
+        return self._mesh
+
+    @property
+    def process_id(self) -> int | None:
+        """The simulator's process while there is one."""
+        return None if self._worker is None else self._worker.pid
+
+    def reset(self, mesh: ClothMesh, vertices_in_world: NDArray[np.float64] | None = None) -> None:
+        """Replace the process by a fresh one; see `ClothEngine.reset`."""
+        vertices = checked_vertices(mesh, vertices_in_world)
+        self.close()
+        self._start()
+        self._ask(
+            {
+                "settings": asdict(self.settings),
+                "motion": asdict(self.motion),
+                "mesh_vertices": mesh.vertices_m.tobytes(),
+                "faces": mesh.faces.tobytes(),
+                "vertices": vertices.tobytes(),
+            }
+        )
+        self._mesh = mesh
+
+    def vertices_in_world(self) -> NDArray[np.float64]:
+        """Where the vertices are, f64[V, 3], metres; see `ClothEngine.vertices_in_world`."""
+        assert len(self._vertices) == len(self.mesh.vertices_m)
+        return self._vertices.copy()
+
+    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
+        """Carry some vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
+        check_grasp(grasped, len(self.mesh.vertices_m))
+        check_drop(drop_xy_m)
+        drop = [float(metres) for metres in drop_xy_m]
+        self._ask({"grasped": grasped.tolist(), "drop_xy_m": drop})
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        worker, self._worker = self._worker, None
+        self._mesh = None
+        if worker is not None:
+            worker.kill()  # it holds nothing that a polite end would save
+            worker.communicate()
+        if self._complaints is not None:
+            self._complaints.close()
+            self._complaints = None
+
+    def _start(self) -> None:
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
+        python_path = os.pathsep.join(
+            [str(_PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])]
+        )
+        try:
+            self._worker = subprocess.Popen(
+                [sys.executable, "-m", "actors.cloth.pybullet_worker"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._complaints,
+                env={**os.environ, "PYTHONPATH": python_path},
+                start_new_session=True,  # an interrupt from the terminal is for the owner alone
+                bufsize=0,
+            )
+        except OSError as error:
+            self.close()
+            raise ClothEngineError(
+                f"PyBulletProcessEngine: expected to start {sys.executable}; got {error}; "
+                "check the limits on processes and open files"
+            ) from error
+
+    def _ask(self, request: dict[str, Any]) -> None:
+        worker = self._worker
+        assert worker is not None
+        assert worker.stdin is not None
+        assert worker.stdout is not None
+        try:
+            write_frame(worker.stdin.fileno(), msgpack.packb(request))
+            reply = msgpack.unpackb(read_frame(worker.stdout.fileno(), self.reply_timeout_secs))
+            self._vertices = np.frombuffer(reply["vertices"]).reshape(-1, 3)
+        except TimeoutError as error:
+            self._lost(f"no answer within {self.reply_timeout_secs:g} s", error)
+        except (BrokenPipeError, EOFError, ValueError, KeyError) as error:
+            self._lost("the end of its process", error)
+        except BaseException:
+            self.close()  # interrupted halfway: the next answer would belong to this request
+            raise
+
+    def _lost(self, what: str, error: Exception) -> None:
+        last_words = self._last_words()
+        self.close()
+        raise ClothEngineError(
+            f"PyBulletProcessEngine: expected the simulator's answer; got {what}"
+            f"{last_words}; reset() starts it anew"
+        ) from error
+
+    def _last_words(self) -> str:
+        if self._complaints is None:
+            return ""
+        self._complaints.seek(0)
+        lines = self._complaints.read().decode("utf-8", "replace").strip().splitlines()
+        return f" ({lines[-1]})" if lines else ""

@@ -1,0 +1,41 @@
+"""The numbers of PyBullet's cloth, apart from PyBullet itself.
+
+They are those with which a 12 x 12 handkerchief of 0.3 m survived hundreds of random actions.
+Finer meshes need shorter time steps, because the springs are integrated explicitly.
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class PyBulletSettings:
+    """Numbers of the simulation; PyBullet gives units to some of them only."""
+
+    time_step_secs: float = 1 / 400
+    """At 1/240 the cloth exploded once in 200 actions, and an action took twice as long."""
+
+    mass_kg: float = 0.05
+    elastic_stiffness: float = 40.0
+    damping_stiffness: float = 0.1
+
+    bending_stiffness: float = 1.0
+    """A handkerchief; 0.5 is softer and suits garments."""
+
+    friction: float = 0.5
+    collision_margin_m: float = 0.003
+
+    def __post_init__(self) -> None:
+        """Check each number.
+
+        Raises:
+            ValueError: a number is not positive.
+        """
+        for setting in fields(self):
+            value = getattr(self, setting.name)
+            if not 0.0 < value < np.inf:
+                raise ValueError(
+                    f"PyBulletSettings.{setting.name}: expected a positive number; got {value}; "
+                    f"the default is {setting.default}"
+                )

@@ -1,0 +1,174 @@
+"""Draws cloth on the table as the camera sees it: a z-buffer, two colours, simple shading.
+
+Coverage is decided in integers, with vertices rounded to 1/256 pixel: two triangles with a common
+edge leave no gap between them and share no pixel, and every machine draws the same picture.
+"""
+
+from dataclasses import dataclass, fields
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.camera import Camera
+
+SUBPIXELS = 256
+AMBIENT = 0.45  # brightness of a face that the light does not reach
+_LIGHT = np.array([0.25, 0.20, 0.95])
+LIGHT_DIRECTION = _LIGHT / np.linalg.norm(_LIGHT)
+
+Rgb = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class ClothColours:
+    """Colours before shading, red, green and blue from 0 to 255.
+
+    `actors.cloth.masks` finds the cloth by its colour: green or red on a nearly grey table.
+    """
+
+    front: Rgb = (40, 170, 60)
+    back: Rgb = (200, 40, 40)
+    table: Rgb = (225, 220, 205)
+
+    def __post_init__(self) -> None:
+        """Check each colour.
+
+        Raises:
+            ValueError: a colour is not three numbers from 0 to 255.
+        """
+        for field in fields(self):
+            colour = getattr(self, field.name)
+            if len(colour) != 3 or not all(0 <= channel <= 255 for channel in colour):
+                raise ValueError(
+                    f"ClothColours.{field.name}: expected 3 numbers from 0 to 255; got {colour}; "
+                    f"the default is {field.default}"
+                )
+
+
+HANDKERCHIEF_COLOURS = ClothColours()
+"""Green in front, red behind."""
+
+
+def draw_cloth(
+    vertices_in_world: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    camera: Camera,
+    colours: ClothColours = HANDKERCHIEF_COLOURS,
+) -> NDArray[np.uint8]:
+    """The camera's picture of cloth on the table.
+
+    Args:
+        vertices_in_world: f64[V, 3], metres, below the camera.
+        faces: i32[F, 3], vertex ids, counter-clockwise seen from the front side.
+        camera: from where.
+        colours: of the cloth's two sides and of the table.
+
+    Returns:
+        u8[size_px, size_px, 3], red, green, blue.
+
+    Raises:
+        ValueError: a vertex is not finite, or not below the camera.
+    """
+    _check_vertices(vertices_in_world, camera)
+    corners = np.rint(camera.project_px(vertices_in_world) * SUBPIXELS).astype(np.int64)
+    nearness = 1.0 / (camera.height_m - vertices_in_world[:, 2])
+    shaded, front_seen = _face_colours(vertices_in_world, faces, corners, colours)
+    picture = np.empty((camera.size_px, camera.size_px, 3), dtype=np.uint8)
+    picture[:] = colours.table
+    _fill_triangles(corners, nearness, faces, shaded, front_seen, picture)
+    return picture
+
+
+def _check_vertices(vertices_in_world: NDArray[np.float64], camera: Camera) -> None:
+    if not np.isfinite(vertices_in_world).all():
+        raise ValueError(
+            "vertices_in_world: expected finite coordinates; got a NaN or an infinity; "
+            "guard() the engine's state before drawing it"
+        )
+    highest_m = float(vertices_in_world[:, 2].max())
+    if highest_m >= camera.height_m:
+        raise ValueError(
+            f"vertices_in_world: expected heights below the camera's {camera.height_m} m; got "
+            f"{highest_m:.3f} m; guard() the engine's state before drawing it"
+        )
+
+
+def _face_colours(
+    vertices_in_world: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    corners: NDArray[np.int64],
+    colours: ClothColours,
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The shaded colour of each face's visible side, u8[F, 3], and whether that is the front."""
+    seen_area = _twice_area(corners[faces[:, 0]], corners[faces[:, 1]], corners[faces[:, 2]])
+    front_seen = seen_area < 0  # counter-clockwise in the world, and the picture's y points down
+    a, b, c = (vertices_in_world[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-15
+    normals[~front_seen] *= -1.0
+    brightness = AMBIENT + (1.0 - AMBIENT) * np.maximum(
+        (normals * LIGHT_DIRECTION).sum(axis=1), 0.0
+    )
+    plain = np.where(front_seen[:, None], colours.front, colours.back)
+    return np.floor(plain * brightness[:, None]).astype(np.uint8), front_seen
+
+
+def _twice_area(
+    a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+
+
+@numba.njit(cache=True)
+def _edge(ax: int, ay: int, bx: int, by: int, x: int, y: int) -> int:
+    """Positive where (x, y) lies inside of the edge from a to b of a positive triangle.
+
+    A pixel centre exactly on an edge belongs to the triangle whose edge runs down, or left.
+    """
+    value = (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+    owned = by > ay or (by == ay and bx < ax)
+    return value if owned else value - 1
+
+
+@numba.njit(cache=True)
+def _fill_triangles(
+    corners: NDArray[np.int64],
+    nearness: NDArray[np.float64],
+    faces: NDArray[np.int32],
+    shaded: NDArray[np.uint8],
+    front_seen: NDArray[np.bool_],
+    picture: NDArray[np.uint8],
+) -> None:
+    """Draw each face where it is nearer than what the picture holds already."""
+    height_px, width_px = picture.shape[0], picture.shape[1]
+    nearest = np.zeros((height_px, width_px))
+    for f in range(faces.shape[0]):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        if front_seen[f]:
+            b, c = c, b
+        ax, ay = corners[a, 0], corners[a, 1]
+        bx, by = corners[b, 0], corners[b, 1]
+        cx, cy = corners[c, 0], corners[c, 1]
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area == 0:
+            continue
+        first_column = max(min(ax, bx, cx) // SUBPIXELS, 0)
+        last_column = min(max(ax, bx, cx) // SUBPIXELS, width_px - 1)
+        first_row = max(min(ay, by, cy) // SUBPIXELS, 0)
+        last_row = min(max(ay, by, cy) // SUBPIXELS, height_px - 1)
+        for row in range(first_row, last_row + 1):
+            y = row * SUBPIXELS + SUBPIXELS // 2
+            for column in range(first_column, last_column + 1):
+                x = column * SUBPIXELS + SUBPIXELS // 2
+                to_a = _edge(bx, by, cx, cy, x, y)
+                to_b = _edge(cx, cy, ax, ay, x, y)
+                to_c = _edge(ax, ay, bx, by, x, y)
+                if to_a < 0 or to_b < 0 or to_c < 0:
+                    continue
+                # 1 / distance is linear in the picture, the distance itself is not.
+                near = (to_a * nearness[a] + to_b * nearness[b] + to_c * nearness[c]) / area
+                if near > nearest[row, column]:
+                    nearest[row, column] = near
+                    for channel in range(3):
+                        picture[row, column, channel] = shaded[f, channel]

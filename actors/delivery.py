@@ -1,0 +1,119 @@
+"""Sends what is spooled until the owner has it: a window of queries, each resent until acked."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+from broker_config.bus import Bus
+from broker_config.errors import BusError, OwnerUnreachable
+from broker_config.messages import Ack, TrajectoryId
+from broker_config.queries import PendingReply
+from broker_config.spool import Spool
+
+_log = logging.getLogger(__name__)
+
+WINDOW = 4
+"""Unanswered trajectories at a time: enough to hide the round trip, few enough to bound memory."""
+
+ACK_TIMEOUT_SECS = 5.0
+RETRY_SECS = 0.5
+
+
+class Delivery:
+    """A thread that empties the spool into the owner's journal, oldest first."""
+
+    def __init__(self, bus: Bus, spool: Spool, key: str) -> None:
+        self._bus = bus
+        self._spool = spool
+        self._key = key
+        self._changed = threading.Condition()
+        self._generation = 0
+        self._closing = False
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="delivery", daemon=True)
+
+    def __enter__(self) -> Delivery:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing = True
+        self.notify()
+        self._thread.join()
+
+    def notify(self) -> None:
+        """Says that the spool has something new."""
+        with self._changed:
+            self._generation += 1
+            self._changed.notify_all()
+
+    def flush(self, keep_waiting: Callable[[], bool]) -> bool:
+        """Waits until everything is acked; returns whether it is.
+
+        Args:
+            keep_waiting: Asked several times a second; False gives up. Nothing is lost by that:
+                what is left is delivered at the next start.
+        """
+        self.notify()
+        with self._changed:
+            while self._spool.status().trajectories and keep_waiting() and self._failure is None:
+                self._changed.wait(0.1)
+            if self._failure is not None:
+                raise self._failure
+            return not self._spool.status().trajectories
+
+    def _run(self) -> None:
+        try:
+            while not self._closing:
+                seen = self._generation
+                delivered = self._deliver_all()
+                with self._changed:
+                    self._changed.notify_all()
+                    if delivered:
+                        self._changed.wait_for(lambda seen=seen: self._generation != seen)  # type: ignore[misc]
+                    else:
+                        self._changed.wait_for(lambda: self._closing, RETRY_SECS)
+        except Exception as error:  # the actor's thread raises it: nothing may be lost in silence
+            _log.exception("Delivery stopped")
+            with self._changed:
+                self._failure = error
+                self._changed.notify_all()
+
+    def _deliver_all(self) -> bool:
+        """One pass over the spool; returns whether all of it was acked."""
+        window: deque[tuple[TrajectoryId, PendingReply[Ack]]] = deque()
+        complete = True
+        for spooled in self._spool.pending():
+            reply = self._bus.ask_later(
+                self._key, spooled.payload, Ack, timeout_secs=ACK_TIMEOUT_SECS
+            )
+            window.append((spooled.id, reply))
+            if len(window) == WINDOW:
+                complete &= self._settle(*window.popleft())
+            if self._closing or not complete:
+                break
+        while window:
+            complete &= self._settle(*window.popleft())
+        return complete
+
+    def _settle(self, id_: TrajectoryId, pending: PendingReply[Ack]) -> bool:
+        try:
+            ack = pending.result()
+        except OwnerUnreachable:
+            return False
+        except BusError as error:
+            _log.error("Trajectory %s refused: %s", id_, error)
+            raise
+        if ack.id != id_:
+            return False
+        self._spool.acknowledge(id_)
+        return True
+
+
+def wait_until(deadline_secs: float) -> Callable[[], bool]:
+    """A `keep_waiting` that gives up at a time of the monotonic clock."""
+    return lambda: time.monotonic() < deadline_secs

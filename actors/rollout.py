@@ -1,0 +1,113 @@
+"""One episode as a ticket asks for it: the loop in which a policy meets an environment."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.envs import ClothbusEnv
+from broker_config.messages import Ticket, Trajectory, TrajectoryId
+
+Observation = NDArray[np.uint8]
+"""u8[H, W, C]."""
+
+
+class ActingPolicy(Protocol):
+    """Whatever chooses actions: a network, a script, chance."""
+
+    def act(self, observation: Observation, generator: np.random.Generator, epsilon: float) -> int:
+        """The index of the action for this picture; random numbers come from `generator` only."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """The episode's first picture."""
+
+    observation: Observation
+
+
+@dataclass(frozen=True)
+class Step:
+    """One transition, without the picture that it started from."""
+
+    action: int
+    reward: float
+    observation: Observation
+    terminated: bool
+    truncated: bool
+    success: bool
+    guard: str | None
+
+
+def rollout(env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> Iterator[Start | Step]:
+    """Plays an episode and yields it as it happens.
+
+    Environment and policy are seeded from the ticket alone, so that an episode of a deterministic
+    environment is the same whoever plays it. The caller may stop between any two steps.
+    """
+    env_seed, policy_seed = np.random.SeedSequence(ticket.seed).spawn(2)
+    generator = np.random.default_rng(policy_seed)
+    observation, _ = env.reset(seed=int(env_seed.generate_state(1)[0]))
+    yield Start(observation)
+    for _ in range(ticket.steps):
+        action = policy.act(observation, generator, ticket.epsilon)
+        observation, reward, terminated, truncated, info = env.step(action)
+        yield _step(action, float(reward), observation, terminated, truncated, info)
+        if terminated or truncated:
+            return
+
+
+def _step(
+    action: int,
+    reward: float,
+    observation: Observation,
+    terminated: bool,
+    truncated: bool,
+    info: dict[str, Any],
+) -> Step:
+    guard = info.get("guard")
+    return Step(
+        action,
+        reward,
+        observation,
+        bool(terminated),
+        bool(truncated),
+        bool(info.get("success", False)),
+        None if guard is None else str(guard),
+    )
+
+
+def to_trajectory(id_: TrajectoryId, ticket: Ticket, start: Start, steps: list[Step]) -> Trajectory:
+    """Joins the parts of a finished episode into the message that is published."""
+    last = steps[-1]
+    return Trajectory(
+        id=id_,
+        ticket=ticket,
+        observations=np.stack([start.observation, *(step.observation for step in steps)]),
+        actions=np.array([step.action for step in steps], np.int32),
+        rewards=np.array([step.reward for step in steps], np.float32),
+        terminated=last.terminated,
+        truncated=not last.terminated,
+        success=last.success,
+        guard=last.guard,
+        interrupted=False,
+        ended_unix_secs=time.time(),
+    )
+
+
+def collect(
+    env: ClothbusEnv,
+    policy: ActingPolicy,
+    ticket: Ticket,
+    id_: TrajectoryId,
+) -> Trajectory:
+    """Plays a whole episode."""
+    parts = list(rollout(env, policy, ticket))
+    start, steps = parts[0], [part for part in parts[1:] if isinstance(part, Step)]
+    assert isinstance(start, Start)
+    return to_trajectory(id_, ticket, start, steps)

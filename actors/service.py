@@ -1,0 +1,269 @@
+"""An actor on the bus: asks for tickets, plays them, spools and delivers what happened."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from actors.acting import collecting_policy
+from actors.delivery import Delivery, wait_until
+from actors.envs import ClothbusEnv, make_env
+from actors.policy import Policy
+from actors.rollout import (
+    ActingPolicy,
+    Start,
+    Step,
+    rollout,
+    to_trajectory,
+)
+from broker_config.bus import Bus
+from broker_config.codec import SCHEMA_VERSION
+from broker_config.errors import AttachRefused, OwnerUnreachable, PresetError, Refused
+from broker_config.heart import Heart
+from broker_config.messages import (
+    Attach,
+    Instruction,
+    Snapshot,
+    SnapshotRequest,
+    Ticket,
+    TicketReply,
+    TicketRequest,
+    Welcome,
+)
+from broker_config.preset import Preset, TaskPreset, preset_from_json
+from broker_config.spool import Spool
+from broker_config.version import VERSION
+
+_log = logging.getLogger(__name__)
+
+R = TypeVar("R")
+
+ASK_TIMEOUT_SECS = 3.0
+TICKET_TIMEOUT_SECS = 4.0
+"""Longer than the owner's long poll."""
+
+RETRY_SECS = 0.5
+
+ATTACH_PATIENCE_SECS = 3.0
+"""A refusal is asked again for so long: a killed process of the same name may still seem alive."""
+
+FLUSH_AT_STOP_SECS = 5.0
+FLUSH_AT_END_SECS = 60.0
+
+
+class StopRequested(Exception):
+    """The process was asked to leave in the middle of something."""
+
+
+def make_task_env(task: TaskPreset) -> ClothbusEnv:
+    """The preset's environment, checked against the shapes that the preset promises.
+
+    Raises:
+        PresetError: Environment and preset disagree.
+    """
+    try:
+        env = make_env(task.environment, horizon=task.horizon, **task.options)
+    except ValueError as error:
+        raise PresetError(f"task: {error}") from error
+    space, actions = env.observation_space, env.action_space
+    got = (tuple(space.shape or ()), int(getattr(actions, "n", 0)))
+    if got != (tuple(task.observation_shape), task.n_actions):
+        env.close()
+        raise PresetError(
+            f"{task.environment}: expected observations {list(task.observation_shape)} and "
+            f"{task.n_actions} actions (preset); got {list(got[0])} and {got[1]}; correct it"
+        )
+    return env
+
+
+class Actor:
+    """One process that acts; `run` returns when the run has ended or the actor was drained."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        spool: Spool,
+        incarnation: str,
+        preset: Preset | None = None,
+        *,
+        spool_steps: bool = False,
+        wrap_env: Callable[[ClothbusEnv], Any] = lambda env: env,
+    ) -> None:
+        """Prepares an actor.
+
+        Args:
+            bus: Its place on the bus, under the same name.
+            name: The actor's.
+            spool: Where trajectories wait for their ack.
+            incarnation: Of this process; another for every start.
+            preset: The preset that the run must have, or None to take the run's.
+            spool_steps: Make each step durable before the next, as a robot must.
+            wrap_env: Gets the environment and returns the one to use.
+        """
+        self._bus = bus
+        self._name = name
+        self._spool = spool
+        self._preset = preset
+        self._spool_steps = spool_steps
+        self._wrap_env = wrap_env
+        self._keys = bus.keys
+        self._incarnation = incarnation
+        self._stop = threading.Event()
+        self._owner_epoch = 0
+        self._state = "attaching"
+        self._policy: tuple[int, ActingPolicy] | None = None
+        self._version = -1
+
+    def stop(self) -> None:
+        """Asks the actor to leave at the next step; safe in a signal handler."""
+        self._stop.set()
+
+    def run(self) -> None:
+        """Acts until the owner says that it is over, or `stop`.
+
+        Raises:
+            AttachRefused: The owner's versions or preset differ.
+            StorageError: The spool cannot be written.
+        """
+        preset = self._attach()
+        if recovered := self._spool.recover():
+            _log.info("Recovered the %d finished steps of %s", recovered.steps, recovered.id)
+        env = self._wrap_env(make_task_env(preset.task))
+        heart = Heart(
+            self._bus,
+            "actor",
+            self._name,
+            self._incarnation,
+            lambda: (self._state, self._numbers()),
+        )
+        key = self._keys.trajectory(self._name)
+        try:
+            with heart, Delivery(self._bus, self._spool, key) as delivery:
+                delivery.flush(lambda: not self._stop.is_set())
+                try:
+                    self._act(env, preset, delivery)
+                except StopRequested:
+                    delivery.flush(wait_until(time.monotonic() + FLUSH_AT_STOP_SECS))
+        finally:
+            env.close()
+
+    def _act(self, env: ClothbusEnv, preset: Preset, delivery: Delivery) -> None:
+        policies = self._bus.latest_reader(self._keys.policy, Snapshot)
+        while True:
+            self._state = "waiting"
+            reply = self._next_ticket()
+            if reply.owner_epoch != self._owner_epoch:
+                self._attach()
+            if reply.instruction in (Instruction.STOP, Instruction.DRAIN):
+                delivery.flush(wait_until(time.monotonic() + FLUSH_AT_END_SECS))
+                _log.info("Leaving: %s", reply.instruction.value)
+                return
+            if reply.ticket is not None:
+                version = reply.ticket.policy_version
+                policy = self._exact_policy(preset, version, policies.get())
+                self._state = "collecting"
+                self._play(env, policy, reply.ticket)
+                delivery.notify()
+
+    # Joining ----------------------------------------------------------------------------------
+
+    def _attach(self) -> Preset:
+        request = Attach(
+            role="actor",
+            id=self._name,
+            incarnation=self._incarnation,
+            schema_version=SCHEMA_VERSION,
+            software_version=VERSION,
+            preset_digest=self._preset.digest if self._preset else "",
+        )
+        key = self._keys.attach("actor", self._name)
+        welcome = self._insist(lambda: self._ask_to_attach(key, request))
+        self._owner_epoch = welcome.owner_epoch
+        preset = preset_from_json(welcome.preset_json)
+        if self._preset is not None and preset.digest != self._preset.digest:
+            raise AttachRefused(f"run {self._keys.run}: its preset changed; restart this actor")
+        self._preset = preset
+        return preset
+
+    def _ask_to_attach(self, key: str, request: Attach) -> Welcome:
+        give_up_secs = time.monotonic() + ATTACH_PATIENCE_SECS
+        while True:
+            try:
+                return self._bus.ask(key, request, Welcome, timeout_secs=ASK_TIMEOUT_SECS)
+            except Refused as error:
+                if time.monotonic() > give_up_secs:
+                    raise AttachRefused(f"run {self._keys.run}: {error}") from error
+                self._stop.wait(RETRY_SECS)
+
+    def _next_ticket(self) -> TicketReply:
+        # One nonce for one question, however often it has to be asked: an answer that came too
+        # late is then not a lost ticket.
+        request = TicketRequest(self._name, self._incarnation, secrets.token_hex(8))
+        key = self._keys.ticket(self._name)
+        return self._insist(
+            lambda: self._bus.ask(key, request, TicketReply, timeout_secs=TICKET_TIMEOUT_SECS)
+        )
+
+    def _insist(self, ask: Callable[[], R]) -> R:
+        """Asks until the owner answers: a simulator can wait for as long as it takes."""
+        while not self._stop.is_set():
+            try:
+                return ask()
+            except OwnerUnreachable as error:
+                self._state = "waiting for the owner"
+                _log.debug("%s", error)
+                self._stop.wait(RETRY_SECS)
+        raise StopRequested
+
+    # Acting -----------------------------------------------------------------------------------
+
+    def _exact_policy(self, preset: Preset, version: int, newest: Snapshot | None) -> ActingPolicy:
+        """The policy of this version, and no other."""
+        if self._policy is None or self._policy[0] != version:
+            snapshot = newest
+            if snapshot is None or snapshot.version != version:
+                self._state = "fetching the policy"
+                request = SnapshotRequest(version)
+                key = self._keys.policy_version(version)
+                snapshot = self._insist(
+                    lambda: self._bus.ask(key, request, Snapshot, timeout_secs=ASK_TIMEOUT_SECS)
+                )
+            policy = Policy.from_bytes(snapshot.network, snapshot.weights)
+            self._policy = version, collecting_policy(preset.algorithm, policy)
+            self._version = version
+        return self._policy[1]
+
+    def _play(self, env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> None:
+        id_ = self._spool.next_id()
+        start: Start | None = None
+        steps: list[Step] = []
+        for event in rollout(env, policy, ticket):
+            if self._stop.is_set():
+                raise StopRequested
+            if isinstance(event, Start):
+                start = event
+                if self._spool_steps:
+                    self._spool.begin(id_, ticket, start.observation)
+            else:
+                steps.append(event)
+                if self._spool_steps:
+                    self._spool.append_step(event.action, event.reward, event.observation)
+        assert start is not None
+        trajectory = to_trajectory(id_, ticket, start, steps)
+        if self._spool_steps:
+            self._spool.finish(
+                terminated=trajectory.terminated,
+                truncated=trajectory.truncated,
+                success=trajectory.success,
+                guard=trajectory.guard,
+            )
+        else:
+            self._spool.put(trajectory)
+
+    def _numbers(self) -> Mapping[str, float]:
+        return {"policy_version": self._version, "spooled": self._spool.status().trajectories}

@@ -1,0 +1,325 @@
+"""The command line: `clothbus COMMAND --help` explains each."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from broker_config.errors import ClothbusError, PresetError
+from broker_config.messages import Command
+from broker_config.preset import Preset
+from broker_config.session import DEFAULT_ADDRESS
+from deploy.process import CONFIGURATION_EXIT, end_with_parent, log_to_stderr
+
+# What a command needs beyond this is imported when it runs: `clothbus status` shall not wait for
+# torch and a physics engine.
+
+app = tyro.extras.SubcommandApp()
+
+Settings = Annotated[tuple[str, ...], tyro.conf.arg(name="set")]
+
+
+@app.command(name="run")
+def run(
+    preset: Annotated[str | None, tyro.conf.Positional] = None,
+    /,
+    actors: int = 1,
+    in_process: bool = False,
+    resume: Path | None = None,
+    runs: Path = Path("runs"),
+    settings: Settings = (),
+    device: str = "cpu",
+    demonstrations: Path | None = None,
+    connect: str | None = None,
+    step_log: Path | None = None,
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Train a preset: router, learner and actors on this machine, with live progress.
+
+    Args:
+        preset: A preset's name or TOML file; `clothbus presets` lists them.
+        actors: Actor processes.
+        in_process: The same cores in one process, without a bus.
+        resume: Continue this run folder instead of starting a preset.
+        runs: Where run folders are made.
+        settings: Settings that replace the preset's: schedule.iterations=3.
+        device: Where the learner computes: cpu, cuda.
+        demonstrations: Folder of `clothbus collect`, for presets with an initialisation.
+        connect: Address of a router that runs already; without it one is started.
+        step_log: File for one line per step on the environment's side.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.presets import load_preset
+    from deploy.run import RunOptions, run_in_process, run_over_bus
+    from deploy.run_folder import RunFolder, create_run_folder
+
+    if (preset is None) == (resume is None):
+        raise PresetError("run: expected a PRESET or --resume FOLDER; give exactly one of them")
+    if resume is not None:
+        folder = RunFolder(resume)
+        chosen = folder.read_preset()
+    else:
+        chosen = load_preset(str(preset), settings)
+        _refuse_unsupported(chosen)
+        folder = create_run_folder(runs, chosen)
+    options = RunOptions(actors, device, connect, demonstrations, step_log, zenoh)
+    carry_out = run_in_process if in_process else run_over_bus
+    carry_out(folder, chosen, options, Console())
+
+
+def _refuse_unsupported(preset: Preset) -> None:
+    from actors.envs import ENV_IDS
+
+    if preset.imitation is not None:
+        raise PresetError(
+            f"{preset.name}: expected a preset without [imitation]; got one; rewards from "
+            "discriminators are not part of this version, choose a preset of chapter 3"
+        )
+    if preset.task.environment not in ENV_IDS:
+        raise PresetError(
+            f"{preset.name}: expected a task of {', '.join(ENV_IDS)}; got "
+            f"{preset.task.environment}; this version does not have it"
+        )
+
+
+@app.command(name="presets")
+def presets() -> None:
+    """List the presets that come with clothbus."""
+    from deploy.presets import load_preset, preset_names
+
+    table = Table("preset", "task", "source")
+    for name in preset_names():
+        preset = load_preset(name)
+        table.add_row(name, preset.task.environment, preset.source)
+    Console().print(table)
+
+
+@app.command(name="router")
+def router(
+    listen: str | None = None, address_file: Path | None = None, zenoh: tuple[str, ...] = ()
+) -> None:
+    """Route the bus.
+
+    Args:
+        listen: Address to listen at; tcp/127.0.0.1:7447 unless an address file is given.
+        address_file: Choose a free port, and write the address into this file.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.roles import run_router
+
+    if listen is None and address_file is None:
+        listen = DEFAULT_ADDRESS
+    run_router(listen, address_file, zenoh)
+
+
+@app.command(name="learner")
+def learner(
+    folder: Annotated[Path, tyro.conf.Positional],
+    /,
+    preset: str | None = None,
+    settings: Settings = (),
+    connect: str = DEFAULT_ADDRESS,
+    device: str = "cpu",
+    demonstrations: Path | None = None,
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Learn, and own the run's journal; an existing run folder is resumed.
+
+    Args:
+        folder: The run folder.
+        preset: For a new folder: a preset's name or TOML file.
+        settings: Settings that replace the preset's.
+        connect: Address of the router.
+        device: Where to compute: cpu, cuda.
+        demonstrations: Folder of `clothbus collect`.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.presets import load_preset
+    from deploy.roles import run_learner
+    from deploy.run_folder import RunFolder, prepare_run_folder
+
+    if preset is None:
+        run_folder = RunFolder(folder)
+    else:
+        chosen = load_preset(preset, settings)
+        _refuse_unsupported(chosen)
+        run_folder = prepare_run_folder(folder, chosen)
+    run_learner(run_folder, run_folder.read_preset(), connect, device, demonstrations, zenoh)
+
+
+@app.command(name="actor")
+def actor(
+    id: str = "actor-0",  # noqa: A002 - the option's name
+    connect: str = DEFAULT_ADDRESS,
+    run: str | None = None,
+    spool: Path | None = None,
+    preset: str | None = None,
+    settings: Settings = (),
+    spool_steps: bool = False,
+    step_log: Path | None = None,
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Act for a run, on this or another machine.
+
+    Args:
+        id: This actor's name; every actor has its own.
+        connect: Address of the router.
+        run: The run's name; not needed when the router carries one run.
+        spool: File in which trajectories wait for their ack; spools/ID.sqlite if not given.
+        preset: What the run must be; without it, the actor takes what the run is.
+        settings: Settings that replace the preset's.
+        spool_steps: Make each step durable before the next, as a robot must.
+        step_log: File for one line per step on the environment's side.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.presets import load_preset
+    from deploy.roles import run_actor
+
+    run_actor(
+        connect,
+        id,
+        spool or Path("spools") / f"{id}.sqlite",
+        run,
+        load_preset(preset, settings) if preset else None,
+        spool_steps,
+        step_log,
+        zenoh,
+    )
+
+
+@app.command(name="status")
+def status(
+    connect: str = DEFAULT_ADDRESS, run: str | None = None, zenoh: tuple[str, ...] = ()
+) -> None:
+    """Show who is alive, the iteration, policy versions, lag and spools.
+
+    Args:
+        connect: Address of the router, or a run folder that `clothbus run` made.
+        run: The run's name; not needed when the router carries one run.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.status import read_status, status_table
+
+    address = _address(connect)
+    name = run or _only_run(address, zenoh)
+    Console().print(status_table(name, read_status(address, name, zenoh)))
+
+
+@app.command(name="control")
+def control(
+    command: Annotated[Command, tyro.conf.Positional],
+    /,
+    connect: str = DEFAULT_ADDRESS,
+    run: str | None = None,
+    actor: str | None = None,
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Pause, resume, drain or stop a run.
+
+    Args:
+        command: What to do; `drain` has actors deliver and leave.
+        connect: Address of the router, or a run folder that `clothbus run` made.
+        run: The run's name; not needed when the router carries one run.
+        actor: The actor to drain; all of them if not given.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.status import send_control
+
+    address = _address(connect)
+    name = run or _only_run(address, zenoh)
+    reply = send_control(address, name, command, actor, zenoh)
+    Console().print(f"{name}: {reply.state}", highlight=False)
+
+
+@app.command(name="evaluate")
+def evaluate(
+    folder: Annotated[Path, tyro.conf.Positional],
+    /,
+    episodes: int = 100,
+    versions: tuple[int, ...] = (),
+    mode: Literal["sampled", "greedy"] = "sampled",
+    jobs: int = 1,
+) -> None:
+    """Score policy versions of a run on seeds of their own.
+
+    Args:
+        folder: The run folder.
+        episodes: Episodes for each version.
+        versions: Policy versions; the untrained and the newest if none is given.
+        mode: Sample actions from the policy, or take the preferred ones.
+        jobs: Processes.
+    """
+    from deploy.evaluate import evaluate as evaluate_versions
+    from deploy.evaluate import score_table
+    from deploy.run_folder import RunFolder
+
+    scores = evaluate_versions(RunFolder(folder), versions, episodes, mode, jobs)
+    Console().print(score_table(scores))
+
+
+@app.command(name="collect")
+def collect(
+    preset: Annotated[str, tyro.conf.Positional],
+    /,
+    output: Path,
+    episodes: int = 10,
+    demonstrator: Literal["scripted", "random"] = "scripted",
+    random_rate: float = 0.0,
+    settings: Settings = (),
+) -> None:
+    """Record demonstrations of a preset's task, without a learner.
+
+    Args:
+        preset: A preset's name or TOML file.
+        output: Folder to record into; an unfinished one is continued.
+        episodes: How many there shall be.
+        demonstrator: Who acts.
+        random_rate: Share of the script's actions that are replaced by random ones.
+        settings: Settings that replace the preset's.
+    """
+    from deploy.collect import collect_demonstrations
+    from deploy.presets import load_preset
+
+    console = Console()
+    chosen = load_preset(preset, settings)
+    _refuse_unsupported(chosen)
+    for trajectory in collect_demonstrations(chosen, output, episodes, demonstrator, random_rate):
+        console.print(
+            f"episode {trajectory.ticket.index + 1} of {episodes}: {trajectory.steps} steps, "
+            f"return {trajectory.return_:.2f}, {'success' if trajectory.success else 'no success'}",
+            highlight=False,
+        )
+
+
+def _address(connect: str) -> str:
+    """The router's address, which a run folder holds in a file."""
+    file = Path(connect) / "router.address"
+    return file.read_text().strip() if file.is_file() else connect
+
+
+def _only_run(address: str, zenoh: tuple[str, ...]) -> str:
+    from deploy.status import only_run
+
+    return only_run(address, zenoh)
+
+
+def main() -> None:
+    """Runs the command; errors that clothbus raises on purpose are one line, not a traceback."""
+    end_with_parent()
+    log_to_stderr()
+    try:
+        app.cli(prog="clothbus", description="Teach robots to handle cloth, over a message bus.")
+    except ClothbusError as error:
+        print(f"clothbus: {error}", file=sys.stderr)  # noqa: T201 - for the person who typed it
+        sys.exit(CONFIGURATION_EXIT)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Starts the processes of a run on this machine, restarts what dies, and leaves none behind."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from broker_config.errors import ClothbusError
+from deploy.process import CONFIGURATION_EXIT, child_environment
+from deploy.topology import ProcessSpec
+
+_log = logging.getLogger(__name__)
+
+SHORT_LIFE_SECS = 5.0
+SHORT_LIVES_BEFORE_GIVING_UP = 5
+STOP_SECS = 8.0
+"""A process that was asked to end has this long; then it is killed, which loses nothing."""
+
+
+class ProcessFailed(ClothbusError):
+    """A process of the run cannot be kept alive."""
+
+
+@dataclass
+class Supervised:
+    """A process and its history."""
+
+    spec: ProcessSpec
+    log_path: Path
+    restarts: int = 0
+    short_lives: int = 0
+    finished: bool = False
+    started_secs: float = 0.0
+    process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+
+    @property
+    def pid(self) -> int | None:
+        """Of the living process."""
+        return self.process.pid if self.process else None
+
+
+class Supervisor:
+    """Keeps a set of processes alive until they finish by themselves or are stopped.
+
+    A process has finished when it exits with code 0. Any other end is an accident: it is started
+    again, unless its exit code says that a restart would not help, or it keeps dying at once.
+    """
+
+    def __init__(self, log_folder: Path) -> None:
+        self._log_folder = log_folder
+        self._processes: dict[str, Supervised] = {}
+
+    def __enter__(self) -> Supervisor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self, spec: ProcessSpec) -> Supervised:
+        """Starts a process; its output goes to `<log folder>/<id>.log`."""
+        supervised = Supervised(spec, self._log_folder / f"{spec.id}.log")
+        self._processes[spec.id] = supervised
+        self._spawn(supervised)
+        return supervised
+
+    @property
+    def processes(self) -> Sequence[Supervised]:
+        """All of them, in the order in which they were started."""
+        return list(self._processes.values())
+
+    def check(self) -> None:
+        """Restarts what died; call it several times a second.
+
+        Raises:
+            ProcessFailed: A process cannot be kept alive; its log's last lines say why.
+        """
+        for supervised in self._processes.values():
+            if supervised.finished or supervised.process is None:
+                continue
+            code = supervised.process.poll()
+            if code == 0:
+                supervised.finished = True
+            elif code is not None:
+                self._restart(supervised, code)
+
+    def has_finished(self, process_id: str) -> bool:
+        """Whether a process has ended by itself, with success."""
+        return self._processes[process_id].finished
+
+    def wait_finished(self, ids: Sequence[str], timeout_secs: float) -> bool:
+        """Waits for processes to finish by themselves; returns whether all did."""
+        deadline_secs = time.monotonic() + timeout_secs
+        while time.monotonic() < deadline_secs:
+            self.check()
+            if all(self.has_finished(process_id) for process_id in ids):
+                return True
+            time.sleep(0.05)
+        return False
+
+    def stop(self) -> None:
+        """Ends what still lives: first those started last, the router after everyone else."""
+        by_role: list[list[Supervised]] = [[], [], []]
+        for supervised in self._processes.values():
+            rank = {"actor": 0, "owner": 1}.get(supervised.spec.role, 2)
+            by_role[rank].append(supervised)
+        for group in by_role:
+            self._terminate(group)
+
+    def _terminate(self, group: Sequence[Supervised]) -> None:
+        living = [item.process for item in group if item.process and item.process.poll() is None]
+        for process in living:
+            process.send_signal(signal.SIGTERM)
+            process.send_signal(signal.SIGCONT)  # a stopped process could not obey
+        deadline_secs = time.monotonic() + STOP_SECS
+        for process in living:
+            try:
+                process.wait(max(0.0, deadline_secs - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def _restart(self, supervised: Supervised, code: int) -> None:
+        lived_secs = time.monotonic() - supervised.started_secs
+        is_short = lived_secs < SHORT_LIFE_SECS
+        supervised.short_lives = supervised.short_lives + 1 if is_short else 0
+        gives_up = supervised.short_lives >= SHORT_LIVES_BEFORE_GIVING_UP
+        if code == CONFIGURATION_EXIT or gives_up:
+            raise ProcessFailed(
+                f"{supervised.spec.id} ended with code {code}: {_last_line(supervised.log_path)} "
+                f"(more in {supervised.log_path})"
+            )
+        _log.warning("%s ended with code %d; starting it again", supervised.spec.id, code)
+        supervised.restarts += 1
+        self._spawn(supervised)
+
+    def _spawn(self, supervised: Supervised) -> None:
+        supervised.started_secs = time.monotonic()
+        with _open_log(supervised.log_path) as log:
+            # A session of its own: Ctrl-C reaches the supervisor only, which then ends the others.
+            supervised.process = subprocess.Popen(  # noqa: S603 - our own command
+                supervised.spec.command,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=dict(child_environment()),
+                start_new_session=True,
+            )
+
+
+def _open_log(path: Path) -> IO[bytes]:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.open("ab")
+
+
+def _last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else "it wrote nothing"

@@ -1,0 +1,67 @@
+"""What every clothbus process does first: logging, one torch thread, an end with its parent."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from types import FrameType
+
+PARENT_VARIABLE = "CLOTHBUS_PARENT_PID"
+"""Set by a supervisor: the process ends when this parent does, however the parent ends."""
+
+CONFIGURATION_EXIT = 3
+"""Exit code of an error that a restart would only repeat."""
+
+_PR_SET_PDEATHSIG = 1
+
+
+def child_environment() -> Mapping[str, str]:
+    """The environment for a child process that must not outlive this one."""
+    single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return {**os.environ, **single, PARENT_VARIABLE: str(os.getpid())}
+
+
+def end_with_parent() -> None:
+    """Has the kernel terminate this process when its supervisor dies (Linux)."""
+    parent = os.environ.get(PARENT_VARIABLE)
+    if parent is None or sys.platform != "linux":
+        return
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != int(parent):  # it died before we asked
+        sys.exit(f"clothbus: supervisor {parent} is gone")
+
+
+def on_terminate(handler: Callable[[], None]) -> None:
+    """Calls `handler` in the main thread on SIGTERM and SIGINT."""
+
+    def handle(_: int, __: FrameType | None) -> None:
+        handler()
+
+    signal.signal(signal.SIGTERM, handle)
+    signal.signal(signal.SIGINT, handle)
+
+
+def interrupt() -> None:
+    """Ends the main thread as Ctrl-C does; for processes whose every state is safe on disk."""
+    raise KeyboardInterrupt
+
+
+def log_to_stderr(verbose: bool = False) -> None:
+    """Logs with time and process name's level, one line each."""
+    logging.basicConfig(
+        level=logging.DEBUG if verbose else logging.INFO,
+        format="%(asctime)s %(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+
+
+def use_one_torch_thread() -> None:
+    """Fixes torch's thread count: results then do not depend on the machine's load or cores."""
+    import torch
+
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(mode=True, warn_only=True)

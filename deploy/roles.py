@@ -1,0 +1,148 @@
+"""The processes of a run, each from its arguments to its end."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+from pathlib import Path
+
+from broker_config.bus import open_bus
+from broker_config.journal import Journal
+from broker_config.ownership import own_run
+from broker_config.preset import Preset
+from broker_config.session import open_router_on_free_port, open_session
+from broker_config.spool import Spool
+from deploy.process import interrupt, on_terminate, use_one_torch_thread
+from deploy.run_folder import RunFolder
+from deploy.status import only_run
+
+_log = logging.getLogger(__name__)
+
+SPOOL_MAX_BYTES = 4 << 30
+
+
+def run_router(
+    listen: str | None, address_file: Path | None = None, overrides: tuple[str, ...] = ()
+) -> None:
+    """Routes until it is told to end.
+
+    Args:
+        listen: The address, or None for the address in the file, or else a free port.
+        address_file: Where the address is written, and read again after a restart.
+        overrides: Zenoh settings.
+
+    Raises:
+        AddressInUse: Another process listens there.
+        ConfigurationError: An override is wrong.
+    """
+    stop = threading.Event()
+    on_terminate(stop.set)
+    if listen is None and address_file is not None and address_file.exists():
+        listen = address_file.read_text().strip()
+    if listen is not None:
+        session = open_session("router", listen, overrides)
+    else:
+        session, listen = open_router_on_free_port(overrides=overrides)
+    with session:
+        if address_file is not None:
+            partial = address_file.with_suffix(".partial")
+            partial.write_text(f"{listen}\n")
+            partial.replace(address_file)
+        _log.info("Routing at %s", listen)
+        stop.wait()
+
+
+def run_learner(
+    folder: RunFolder,
+    preset: Preset,
+    address: str,
+    device: str = "cpu",
+    demonstrations: Path | None = None,
+    overrides: tuple[str, ...] = (),
+) -> None:
+    """Learns until the run is complete; a second start resumes from the newest checkpoint.
+
+    Raises:
+        AlreadyOwned: Another learner has the run.
+        RouterUnreachable: There is no router at the address.
+        StorageError: The folder cannot be used.
+    """
+    from learner.checkpoint import CheckpointStore
+    from learner.learning import LearningLoop
+    from learner.metrics import LearningMetrics
+    from learner.owner import Owner
+    from learner.recorded import read_demonstrations
+    from learner.service import LearnerService
+    from learner.snapshots import SnapshotStore
+    from learner.trainer import Trainer
+
+    on_terminate(interrupt)
+    use_one_torch_thread()
+    with (
+        own_run(folder.path),
+        Journal(folder.journal) as journal,
+        open_bus(address, folder.run, "owner", "learner", overrides) as bus,
+        LearningMetrics(folder.tensorboard) as metrics,
+    ):
+        owner = Owner(folder.run, preset, journal)
+        snapshots = SnapshotStore(folder.snapshots)
+        loop = LearningLoop(
+            owner,
+            Trainer(preset, device),
+            CheckpointStore(folder.checkpoints),
+            snapshots,
+            read_demonstrations(demonstrations) if demonstrations else (),
+        )
+        LearnerService(bus, "learner", owner, loop, journal, snapshots, metrics).run()
+
+
+def run_actor(
+    address: str,
+    actor: str,
+    spool_path: Path,
+    run: str | None = None,
+    preset: Preset | None = None,
+    spool_steps: bool = False,
+    step_log: Path | None = None,
+    overrides: tuple[str, ...] = (),
+) -> None:
+    """Acts for a run until it ends.
+
+    Args:
+        address: The router's.
+        actor: This actor's name.
+        spool_path: The file in which its trajectories wait.
+        run: The run, or None if the router carries only one.
+        preset: What the run must be, or None to take what it is.
+        spool_steps: Make each step durable before the next, as a robot must.
+        step_log: Where to write one line for each step on the environment's side.
+        overrides: Zenoh settings.
+
+    Raises:
+        AttachRefused: Versions or presets differ, or the name is taken.
+        OwnerUnreachable: The router carries no run, or several and none was named.
+        RouterUnreachable: There is no router at the address.
+        StorageError: The spool cannot be used.
+    """
+    from actors.service import Actor
+    from actors.step_log import StepLog
+
+    use_one_torch_thread()
+    incarnation = secrets.token_hex(8)
+    run = run or only_run(address, overrides)
+    with (
+        Spool(spool_path, actor, incarnation, SPOOL_MAX_BYTES) as spool,
+        open_bus(address, run, "actor", actor, overrides) as bus,
+    ):
+        process = Actor(
+            bus,
+            actor,
+            spool,
+            incarnation,
+            preset,
+            spool_steps=spool_steps,
+            wrap_env=lambda env: StepLog(env, step_log, incarnation) if step_log else env,
+        )
+        on_terminate(process.stop)
+        process.run()

@@ -1,0 +1,61 @@
+"""Which processes make up a run: data, apart from how they are started."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from broker_config.messages import Role
+
+
+@dataclass(frozen=True)
+class ProcessSpec:
+    """One process of a run."""
+
+    role: Role
+    id: str
+    arguments: tuple[str, ...]
+    """After `python -m deploy.cli`."""
+
+    @property
+    def command(self) -> list[str]:
+        """The whole command line."""
+        return [sys.executable, "-m", "deploy.cli", *self.arguments]
+
+
+def router_process(address_file: Path, overrides: tuple[str, ...] = ()) -> ProcessSpec:
+    """The embedded router; it chooses a free port and writes its address into the file."""
+    arguments = ("router", "--address-file", str(address_file), *_zenoh(overrides))
+    return ProcessSpec("router", "router", arguments)
+
+
+def learner_process(
+    folder: Path,
+    address: str,
+    device: str = "cpu",
+    demonstrations: Path | None = None,
+    overrides: tuple[str, ...] = (),
+) -> ProcessSpec:
+    """The learner of a run folder."""
+    given = ("--demonstrations", str(demonstrations)) if demonstrations else ()
+    arguments = ("learner", str(folder), "--connect", address, "--device", device, *given)
+    return ProcessSpec("owner", "learner", (*arguments, *_zenoh(overrides)))
+
+
+def actor_process(
+    run: str,
+    actor: str,
+    spool: Path,
+    address: str,
+    step_log: Path | None = None,
+    overrides: tuple[str, ...] = (),
+) -> ProcessSpec:
+    """An actor that takes the preset of the run."""
+    arguments = ("actor", "--run", run, "--id", actor, "--connect", address, "--spool", str(spool))
+    logged = ("--step-log", str(step_log)) if step_log else ()
+    return ProcessSpec("actor", actor, (*arguments, *logged, *_zenoh(overrides)))
+
+
+def _zenoh(overrides: tuple[str, ...]) -> tuple[str, ...]:
+    return ("--zenoh", *overrides) if overrides else ()

@@ -1,0 +1,220 @@
+"""The loop that joins journal and trainer: absorb the next complete ticket, update, make it known.
+
+The order of commits (each step may be repeated): trajectory journaled -> memory -> update ->
+checkpoint -> snapshot stored and journaled -> the tickets that act on it are issued. After a crash
+the loop starts from the newest checkpoint and absorbs the journal's tickets again from there, which
+gives the same weights.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from broker_config.errors import PresetError
+from broker_config.messages import (
+    IterationEnded,
+    Snapshot,
+    SnapshotTaken,
+    Trajectory,
+    weights_digest,
+)
+from learner.checkpoint import CheckpointStore
+from learner.owner import Owner
+from learner.snapshots import SnapshotStore
+from learner.trainer import Trainer, UpdateReport
+
+_log = logging.getLogger(__name__)
+
+WAIT_SECS = 0.5
+"""How often the loop looks up while nothing arrives."""
+
+
+@dataclass(frozen=True)
+class PolicyReady:
+    """A policy version exists, is stored and journaled."""
+
+    snapshot: Snapshot
+    report: UpdateReport | None
+    """None when it was restored or is the untrained policy."""
+
+
+@dataclass(frozen=True)
+class EpisodeAbsorbed:
+    """A ticket's trajectories are in the memory, and learned from if it was their turn."""
+
+    index: int
+    iteration: int
+    return_: float
+    success: bool
+    steps: int
+    policy_lag: int
+    """Updates made since the version on which the episode acted."""
+
+
+class LearningLoop:
+    """Iterating over it runs the learner; statistics and publishing stay with the caller."""
+
+    def __init__(
+        self,
+        owner: Owner,
+        trainer: Trainer,
+        checkpoints: CheckpointStore,
+        snapshots: SnapshotStore,
+        demonstrations: Sequence[Trajectory] = (),
+        wait_ready: Callable[[int], bool] | None = None,
+    ) -> None:
+        """Joins the parts.
+
+        Args:
+            owner: Of the run.
+            trainer: New; it is restored from the newest checkpoint if there is one.
+            checkpoints: Of the run.
+            snapshots: Of the run.
+            demonstrations: For Algorithm 2, if the preset asks for it and the run is new.
+            wait_ready: Waits, for a while, until a ticket is ready, and says whether it is. Without
+                a bus this is where the episode is played.
+        """
+        self._wait_ready = wait_ready or (lambda index: owner.wait_ready(index, WAIT_SECS))
+        self._owner = owner
+        self._trainer = trainer
+        self._checkpoints = checkpoints
+        self._snapshots = snapshots
+        self._demonstrations = demonstrations
+        self._schedule = owner.preset.schedule
+        self._absorbed = 0
+        self._version = 0
+        self._report: UpdateReport | None = None
+
+    def __iter__(self) -> Iterator[PolicyReady | EpisodeAbsorbed]:
+        """Yields what happens until the run is complete or was stopped."""
+        if not self._restore():
+            self._initialise()
+            self._save_checkpoint()
+        yield self._make_known()
+        while self._absorbed < self._schedule.episodes:
+            if not self._wait_ready(self._absorbed):
+                if self._owner.is_stopping:
+                    return
+                continue
+            yield self._absorb()
+            if self._schedule.updates_after(self._absorbed - 1):
+                self._report = self._trainer.update()
+                self._version += 1
+                self._save_checkpoint()
+                yield self._make_known()
+
+    # Start ------------------------------------------------------------------------------------
+
+    def _restore(self) -> bool:
+        checkpoint = self._checkpoints.latest()
+        if checkpoint is None:
+            return False
+        self._trainer.set_state(checkpoint.state)
+        self._absorbed = int(checkpoint.extra["absorbed"])
+        self._version = int(checkpoint.extra["version"])
+        _log.info("Resumed at policy version %d after %d tickets", self._version, self._absorbed)
+        return True
+
+    def _initialise(self) -> None:
+        """Algorithm 2: demonstrations into the memory, then K target switches."""
+        wanted = self._owner.preset.initialisation
+        if wanted is None:
+            if self._demonstrations:
+                raise PresetError(
+                    f"{self._owner.preset.name}: expected an [initialisation] table to use the "
+                    "demonstrations by; add it to the preset, or leave the demonstrations out"
+                )
+            return
+        if self._demonstrations:
+            self._owner.keep_demonstrations(self._demonstrations)
+        kept = self._owner.demonstrations()
+        available = sum(item.steps for item in kept)
+        if available < wanted.demonstration_samples:
+            raise PresetError(
+                f"{self._owner.preset.name}: expected {wanted.demonstration_samples} demonstration "
+                f"samples; got {available}; record more with `clothbus collect` and name the file "
+                "with --demonstrations"
+            )
+        left = wanted.demonstration_samples
+        for item in kept:
+            steps = min(left, item.steps)
+            self._add(item, steps)
+            left -= steps
+            if left == 0:
+                break
+        self._report = self._trainer.update(wanted.target_switches)
+
+    # One step ---------------------------------------------------------------------------------
+
+    def _absorb(self) -> EpisodeAbsorbed:
+        index = self._absorbed
+        parts = self._owner.trajectories(index)
+        for part in parts:
+            self._add(part, part.steps)
+        self._absorbed += 1
+        return EpisodeAbsorbed(
+            index=index,
+            iteration=index // self._schedule.episodes_per_iteration,
+            return_=sum(part.return_ for part in parts),
+            success=parts[-1].success,
+            steps=sum(part.steps for part in parts),
+            policy_lag=self._version - parts[0].ticket.policy_version,
+        )
+
+    def _add(self, trajectory: Trajectory, steps: int) -> None:
+        self._trainer.add(
+            trajectory.observations[: steps + 1],
+            trajectory.actions[:steps],
+            trajectory.rewards[:steps],
+            terminated=trajectory.terminated and steps == trajectory.steps,
+        )
+
+    # After a step -----------------------------------------------------------------------------
+
+    def _save_checkpoint(self) -> None:
+        extra = {"absorbed": self._absorbed, "version": self._version}
+        self._checkpoints.save(self._trainer.get_state(), extra)
+
+    def _make_known(self) -> PolicyReady:
+        """Stores and journals the current policy; doing it twice changes nothing."""
+        weights = self._trainer.weights_bytes()
+        snapshot = Snapshot(
+            self._version,
+            self._owner.epoch,
+            self._owner.preset.network,
+            weights,
+            weights_digest(weights),
+        )
+        self._snapshots.put(snapshot.version, weights)
+        per_iteration = self._schedule.episodes_per_iteration
+        if self._absorbed and self._absorbed % per_iteration == 0:
+            self._owner.iteration_ended(self._iteration(self._absorbed // per_iteration - 1))
+        self._owner.policy_ready(SnapshotTaken(self._version, snapshot.digest, self._absorbed))
+        self._snapshots.retain(self._schedule.policy_lag + 2, self._pinned_versions())
+        report, self._report = self._report, None
+        return PolicyReady(snapshot, report)
+
+    def _pinned_versions(self) -> frozenset[int]:
+        """The untrained policy and one version for each iteration are kept for evaluation."""
+        per_iteration = self._schedule.episodes_per_iteration
+        ends = range(0, self._schedule.episodes + 1, per_iteration)
+        return frozenset(self._schedule.updates_before(end) for end in ends)
+
+    def _iteration(self, number: int) -> IterationEnded:
+        per_iteration = self._schedule.episodes_per_iteration
+        tickets = range(number * per_iteration, (number + 1) * per_iteration)
+        episodes = [self._owner.trajectories(index) for index in tickets]
+        ids = "\n".join(str(part.id) for episode in episodes for part in episode)
+        returns = [sum(part.return_ for part in episode) for episode in episodes]
+        successes = [episode[-1].success for episode in episodes]
+        return IterationEnded(
+            number,
+            hashlib.sha256(ids.encode()).hexdigest(),
+            float(np.mean(returns)),
+            float(np.mean(successes)),
+        )

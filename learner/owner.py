@@ -1,0 +1,351 @@
+"""The durable owner of a run: everything that counts is in its journal before anyone is told.
+
+Journal entries are named, and a name is appended at most once, so that every step may be repeated
+after a crash:
+
+====================================  ==============================================================
+`run/<epoch>`                         `RunStarted`
+`demonstration/<number>`              `Trajectory`, what the policy was initialised from
+`ticket/<index>/<attempt>`            `TicketIssued`
+`trajectory/<actor>/<inc.>/<seq.>`    `Trajectory`, every attempt that arrived
+`ended/<actor>/<inc.>/<seq.>`         `AttemptEnded`, in the transaction of its trajectory
+`lost/<index>/<attempt>`              `AttemptEnded` without a trajectory
+`reseeded/<index>/<generation>`       `TicketReseeded`
+`snapshot/<version>/<digest>`         `SnapshotTaken`
+`iteration/<number>`                  `IterationEnded`
+`control/<epoch>/<number>`            `Control`
+====================================  ==============================================================
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+
+from broker_config.codec import SCHEMA_VERSION, decode, decode_any, encode
+from broker_config.errors import StorageError
+from broker_config.journal import Appended, Journal
+from broker_config.messages import (
+    Ack,
+    Attach,
+    AttemptEnded,
+    Command,
+    Control,
+    ControlReply,
+    Instruction,
+    IterationEnded,
+    Refusal,
+    RunStarted,
+    SnapshotTaken,
+    TicketIssued,
+    TicketReply,
+    TicketRequest,
+    TicketReseeded,
+    Trajectory,
+    TrajectoryId,
+    Welcome,
+)
+from broker_config.preset import Preset
+from broker_config.version import VERSION
+from learner.recorded import trajectory_name
+from learner.tickets import TicketBook, TicketEvent
+
+_log = logging.getLogger(__name__)
+
+
+class Owner:
+    """Issues tickets, takes trajectories and keeps the journal of one run.
+
+    Thread-safe: the bus's threads and the learning thread share it. `changed` is notified, and
+    `changes` grows, whenever a waiting ticket request or the learning loop may go on.
+    """
+
+    def __init__(self, run: str, preset: Preset, journal: Journal) -> None:
+        """Takes the run: replays its journal and notes the new epoch.
+
+        Raises:
+            StorageError: The journal belongs to another preset, or cannot be written.
+        """
+        self.run = run
+        self.preset = preset
+        self.changed = threading.Condition()
+        self.changes = 0
+        self._journal = journal
+        self._book = TicketBook(preset)
+        self._stored: set[TrajectoryId] = set()
+        self._latest_version = -1
+        self._paused = False
+        self._stopping = False
+        self._draining: set[str] = set()
+        self._controls = 0
+        self._failure: StorageError | None = None
+        self.epoch = self._replay() + 1
+        started = RunStarted(run, self.epoch, preset.to_json(), VERSION)
+        self._append((f"run/{self.epoch}", started)).result()
+
+    def note_change(self) -> None:
+        """Wakes whoever waits for something to happen."""
+        with self.changed:
+            self.changes += 1
+            self.changed.notify_all()
+
+    # Joining ----------------------------------------------------------------------------------
+
+    def attach(self, request: Attach) -> Welcome | Refusal:
+        """Lets a process join if it speaks the same contract about the same preset."""
+        rules = [
+            ("schema version", str(SCHEMA_VERSION), str(request.schema_version)),
+            ("clothbus version", VERSION, request.software_version),
+        ]
+        if request.preset_digest:
+            rules.append(("preset digest", self.preset.digest, request.preset_digest))
+        for subject, expected, got in rules:
+            if expected != got:
+                advice = (
+                    f"start {request.id} without a preset: it then takes the run's"
+                    if subject == "preset digest"
+                    else "install the same clothbus version on both machines"
+                )
+                return Refusal(subject, expected, got, advice)
+        return Welcome(self.run, self.epoch, self.preset.to_json())
+
+    # Tickets ----------------------------------------------------------------------------------
+
+    def issue(
+        self, request: TicketRequest, now_secs: float
+    ) -> tuple[TicketReply, Future[tuple[Appended, ...]]] | None:
+        """Answers a ticket request, or None while there is nothing to collect.
+
+        The answer may be sent once the future has resolved: then it is in the journal.
+        """
+        with self.changed:
+            instruction = self._instruction(request.actor)
+            ticket, events = None, list[TicketEvent]()
+            if instruction is Instruction.COLLECT:
+                ticket, events = self._book.issue(request, self._latest_version, now_secs)
+                if ticket is None and not events:
+                    return None
+                if ticket is None:
+                    instruction = Instruction.WAIT
+            reply = TicketReply(instruction, request.nonce, self.epoch, ticket)
+            return reply, self._append(*map(_named, events))
+
+    def _instruction(self, actor: str) -> Instruction:
+        if self._book.all_complete or self._stopping:
+            return Instruction.STOP
+        if actor in self._draining:
+            return Instruction.DRAIN
+        return Instruction.WAIT if self._paused else Instruction.COLLECT
+
+    def wait_reply(self, request: TicketRequest) -> TicketReply:
+        """What a request gets when its long poll ends without a ticket."""
+        return TicketReply(Instruction.WAIT, request.nonce, self.epoch)
+
+    def heard(self, actor: str, incarnation: str, now_secs: float) -> None:
+        """Renews an actor's leases."""
+        with self.changed:
+            self._book.heard(actor, incarnation, now_secs)
+
+    def expire_leases(self, now_secs: float) -> None:
+        """Gives up what silent actors were collecting, so that others collect it again."""
+        with self.changed:
+            if events := self._book.expire(now_secs):
+                self._append(*map(_named, events))
+                self.note_change()
+
+    # Trajectories -----------------------------------------------------------------------------
+
+    def receive(
+        self, trajectory: Trajectory, payload: bytes, committed: Callable[[Ack], None]
+    ) -> None:
+        """Takes a trajectory; `committed` is called from another thread once it is durable.
+
+        A resend is recognised by its id and acknowledged again, and changes nothing. If the journal
+        fails, `committed` is not called and the sender keeps what it has.
+
+        Raises:
+            MessageError: The preset's network cannot learn from it.
+        """
+        trajectory.check_fits(self.preset.network)
+        with self.changed:
+            known = self._book.verdict(trajectory.id)
+            events = [] if known else self._book.close(trajectory)
+            verdict = known or self._book.verdict(trajectory.id)
+            assert verdict is not None
+            future = self._append((trajectory_name(trajectory.id), payload), *map(_named, events))
+
+        def acknowledge(done: Future[tuple[Appended, ...]]) -> None:
+            if done.exception() is not None:
+                return
+            stored = done.result()[0]
+            with self.changed:
+                self._stored.add(trajectory.id)
+                self.note_change()
+            is_duplicate = not stored.is_new
+            committed(Ack(trajectory.id, self.epoch, stored.offset, verdict, is_duplicate))
+
+        future.add_done_callback(acknowledge)
+
+    # What the learning loop asks --------------------------------------------------------------
+
+    @property
+    def latest_version(self) -> int:
+        """Newest policy version that tickets may name; -1 before there is one."""
+        return self._latest_version
+
+    @property
+    def all_complete(self) -> bool:
+        """Whether every episode of the run is in the journal."""
+        with self.changed:
+            return self._book.all_complete
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether the run was asked to stop before its end."""
+        return self._stopping
+
+    def is_ready(self, index: int) -> bool:
+        """Whether ticket `index` is complete and durable."""
+        with self.changed:
+            return self._book.is_complete(index) and self._stored.issuperset(
+                self._book.parts(index)
+            )
+
+    def wait_ready(self, index: int, timeout_secs: float) -> bool:
+        """Waits until ticket `index` is complete and durable, or the time or the run is over.
+
+        Raises:
+            StorageError: The journal could not be written; the run cannot go on.
+        """
+        with self.changed:
+            self.changed.wait_for(
+                lambda: self.is_ready(index) or self._stopping or self._failure, timeout_secs
+            )
+            if self._failure is not None:
+                raise self._failure
+            return self.is_ready(index)
+
+    def trajectories(self, index: int) -> list[Trajectory]:
+        """The accepted parts of a complete ticket, from the journal."""
+        found = []
+        for part in self._book.parts(index):
+            entry = self._journal.find(trajectory_name(part))
+            if entry is None:
+                raise StorageError(f"journal: expected trajectory {part}; it is not there")
+            found.append(decode(entry.payload, Trajectory))
+        return found
+
+    def demonstrations(self) -> list[Trajectory]:
+        """What was given to `keep_demonstrations`, in any epoch."""
+        entries = self._journal.entries(prefix="demonstration/")
+        return [decode(entry.payload, Trajectory) for entry in entries]
+
+    def keep_demonstrations(self, demonstrations: Sequence[Trajectory]) -> None:
+        """Makes the demonstrations part of the run's record."""
+        self._append(
+            *((f"demonstration/{n:06d}", item) for n, item in enumerate(demonstrations))
+        ).result()
+
+    def policy_ready(self, snapshot: SnapshotTaken) -> None:
+        """Journals a policy version; from then on tickets may name it."""
+        self._append((f"snapshot/{snapshot.version}/{snapshot.digest[:16]}", snapshot)).result()
+        with self.changed:
+            self._latest_version = snapshot.version
+            self.note_change()
+
+    def iteration_ended(self, iteration: IterationEnded) -> None:
+        """Journals the end of an iteration."""
+        self._append((f"iteration/{iteration.iteration}", iteration)).result()
+
+    # Control ----------------------------------------------------------------------------------
+
+    def control(self, control: Control, actors: Iterable[str] = ()) -> ControlReply:
+        """Does what a person asked, and journals it.
+
+        Args:
+            control: The command.
+            actors: Who is there, for a `drain` that names nobody.
+        """
+        with self.changed:
+            self._controls += 1
+            future = self._append((f"control/{self.epoch}/{self._controls}", control))
+            self._apply_control(control, actors)
+            self.note_change()
+            state = "stopping" if self._stopping else "paused" if self._paused else "running"
+        future.result()
+        return ControlReply(control.command, state)
+
+    def stop(self) -> None:
+        """Ends the run early: actors are told, `wait_ready` returns."""
+        with self.changed:
+            self._stopping = True
+            self.note_change()
+
+    def _apply_control(self, control: Control, actors: Iterable[str]) -> None:
+        match control.command:
+            case Command.PAUSE:
+                self._paused = True
+            case Command.RESUME:
+                self._paused = False
+                self._draining.clear()
+            case Command.DRAIN:
+                self._draining.update([control.actor] if control.actor else actors)
+            case Command.STOP:
+                self._stopping = True
+
+    # The journal ------------------------------------------------------------------------------
+
+    def _append(self, *entries: tuple[str, object]) -> Future[tuple[Appended, ...]]:
+        future = self._journal.append(
+            [(name, item if isinstance(item, bytes) else encode(item)) for name, item in entries]
+        )
+        future.add_done_callback(self._note_failure)
+        return future
+
+    def _note_failure(self, done: Future[tuple[Appended, ...]]) -> None:
+        error = done.exception()
+        if error is None:
+            return
+        _log.error("The run cannot go on: %s", error)
+        with self.changed:
+            self._failure = (
+                error if isinstance(error, StorageError) else StorageError(f"journal: {error}")
+            )
+            self.note_change()
+
+    def _replay(self) -> int:
+        """Rebuilds the book; returns the last epoch."""
+        epoch = 0
+        for entry in self._journal.entries(without_prefix="trajectory/"):
+            match decode_any(entry.payload):
+                case RunStarted() as started:
+                    epoch = started.owner_epoch
+                    self._refuse_other_preset(started)
+                case TicketIssued() | AttemptEnded() | TicketReseeded() as event:
+                    self._book.apply(event)
+                    if isinstance(event, AttemptEnded) and event.trajectory is not None:
+                        self._stored.add(event.trajectory)
+                case Control(command=Command.PAUSE | Command.RESUME) as control:
+                    self._apply_control(control, ())
+        return epoch
+
+    def _refuse_other_preset(self, started: RunStarted) -> None:
+        if started.preset_json != self.preset.to_json():
+            raise StorageError(
+                f"journal: expected preset {self.preset.name} ({self.preset.digest[:12]}); "
+                "got a run of another preset; resume it with its own, or choose another run folder"
+            )
+
+
+def _named(event: TicketEvent) -> tuple[str, TicketEvent]:
+    match event:
+        case TicketIssued(ticket=ticket):
+            return f"ticket/{ticket.index}/{ticket.attempt}", event
+        case AttemptEnded(trajectory=None):
+            return f"lost/{event.ticket}/{event.attempt}", event
+        case AttemptEnded():
+            return f"ended/{event.trajectory}", event
+        case TicketReseeded():
+            return f"reseeded/{event.ticket}/{event.generation}", event

@@ -1,0 +1,40 @@
+"""Reads what an owner has recorded: the trajectories of a journal that count."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from broker_config.codec import decode
+from broker_config.errors import StorageError
+from broker_config.journal import JOURNAL_FILE, JournalReader
+from broker_config.messages import AttemptEnded, Trajectory, TrajectoryId, Verdict
+
+
+def trajectory_name(trajectory: TrajectoryId) -> str:
+    """The journal's name of a trajectory."""
+    return f"trajectory/{trajectory}"
+
+
+def accepted_trajectories(journal: JournalReader) -> Iterator[Trajectory]:
+    """The trajectories of a journal that count, in order of tickets and parts."""
+    accepted: list[tuple[int, int, TrajectoryId]] = []
+    for entry in journal.entries(prefix="ended/"):
+        ended = decode(entry.payload, AttemptEnded)
+        if ended.verdict is Verdict.ACCEPTED and ended.trajectory is not None:
+            accepted.append((ended.ticket, entry.offset, ended.trajectory))
+    for _, _, trajectory in sorted(accepted, key=lambda item: item[:2]):
+        entry_or_none = journal.find(trajectory_name(trajectory))
+        if entry_or_none is None:
+            raise StorageError(f"journal: expected trajectory {trajectory}; it is not there")
+        yield decode(entry_or_none.payload, Trajectory)
+
+
+def read_demonstrations(folder: Path) -> list[Trajectory]:
+    """The accepted trajectories of a folder that `clothbus collect` or a run has written.
+
+    Raises:
+        StorageError: There is no journal in it.
+    """
+    with JournalReader(folder / JOURNAL_FILE) as journal:
+        return list(accepted_trajectories(journal))

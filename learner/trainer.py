@@ -1,0 +1,331 @@
+"""The learner's core: a local memory, a network, and UpdatePNetwork. It knows no bus.
+
+Source: algorithms 1 and 2. Each sub-problem of an update trains against a target network that is
+frozen, and switches it at its end. At the beginning of a sub-problem target network and network are
+therefore equal: the teaching signals of the whole memory are computed there, once, and no second
+network is kept. This holds for DPN, EDPN and DQN alike, which differ in the teaching signal only.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from actors.networks import build_network, weights_to_bytes
+from broker_config.errors import MessageError, StorageError
+from broker_config.preset import Preset
+from learner.cuda_graph import GraphedSteps, exact_float32
+from learner.gradient_steps import EagerSteps, GradientSteps
+from learner.memory import LocalMemory
+from learner.optimiser import build_optimiser, named_state, overwrite
+from learner.teaching_signal import (
+    bellman_error,
+    bellman_target,
+    dpn_teaching_signal,
+    entropy,
+    epsilon_greedy_entropy,
+    epsilon_greedy_value,
+    soft_value,
+)
+
+_EVALUATED_AT_ONCE = 128
+"""Pictures for which preferences are computed at a time."""
+_WEIGHTS_STREAM, _SHUFFLING_STREAM = 0, 1
+"""Independent random numbers of one preset seed."""
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What an update did. Values and entropies are those of the updated network on the memory."""
+
+    losses: tuple[float, ...]
+    """Mean loss over the gradient steps of each sub-problem."""
+    gradient_steps: int
+    mean_value: float
+    """Mean V(s): soft value, or E over the epsilon-greedy policy of Q for DQN."""
+    mean_entropy: float
+    """Mean entropy of the acting policy, in nats."""
+    bellman_error: float
+    """Eq. 3.6, mean over the sub-problems."""
+    relative_bellman_error: float
+    """The same in standard deviations of V."""
+    secs: float
+
+    @property
+    def loss(self) -> float:
+        """Mean loss of the last sub-problem."""
+        return self.losses[-1]
+
+
+@dataclass(frozen=True)
+class TrainerState:
+    """All that a trainer's future depends on, besides its preset."""
+
+    tensors: Mapping[str, Tensor]
+    """Contiguous, on the CPU."""
+    counters: Mapping[str, int]
+
+
+@dataclass
+class _Counters:
+    updates: int = 0
+    target_switches: int = 0
+    gradient_steps: int = 0
+
+
+class _Assessment(NamedTuple):
+    """What the network says of every sample of the memory."""
+
+    teaching_signals: Tensor
+    """y with this network as the target network, f32[n]."""
+    values: Tensor
+    """V(s), f32[n]."""
+    bellman_targets: Tensor
+    """r + gamma * V(s'), f32[n]."""
+    mean_entropy: Tensor
+    """f32[]."""
+
+
+class Trainer:
+    """Improves a network from trajectories.
+
+    Its results are a function of the preset and of the calls made, bit for bit on one type of CPU
+    with one number of threads; on a GPU they are equal up to rounding.
+    """
+
+    def __init__(self, preset: Preset, device: str = "cpu") -> None:
+        self._preset = preset
+        algorithm, schedule = preset.algorithm, preset.schedule
+        self._network = build_network(
+            preset.network,
+            _derived_seed(preset.seed, _WEIGHTS_STREAM),
+            starts_at_zero_value=algorithm.method != "dqn",
+        ).to(device)
+        self._optimiser = build_optimiser(preset.optimiser, self._network)
+        self._memory = LocalMemory(schedule.memory_samples, preset.task.observation_shape, device)
+        self._shuffling = torch.Generator().manual_seed(
+            _derived_seed(preset.seed, _SHUFFLING_STREAM)
+        )
+        self._counters = _Counters()
+        steps = GraphedSteps if self._memory.device.type == "cuda" else EagerSteps
+        self._steps: GradientSteps = steps(self._network, self._optimiser, self._memory)
+
+    @property
+    def memory(self) -> LocalMemory:
+        """The local memory D."""
+        return self._memory
+
+    @property
+    def gradient_steps(self) -> int:
+        """Gradient steps made since the beginning."""
+        return self._counters.gradient_steps
+
+    def add(
+        self,
+        observations: NDArray[np.uint8],
+        actions: NDArray[np.int32],
+        rewards: NDArray[np.float32],
+        terminated: bool,
+    ) -> None:
+        """Adds a trajectory to the memory; see `LocalMemory.add`."""
+        out_of_range = (actions < 0) | (actions >= self._preset.task.n_actions)
+        if out_of_range.any():
+            raise MessageError(
+                f"trajectory.actions: expected 0 to {self._preset.task.n_actions - 1}; got "
+                f"{actions[out_of_range][0]}; actor and learner run different presets"
+            )
+        self._memory.add(observations, actions, rewards, terminated)
+
+    def initialise(self) -> UpdateReport:
+        """Trains on the demonstrations that were added, for K target switches.
+
+        Source: algorithm 2.
+
+        Raises:
+            MessageError: The preset has no initialisation, or the memory is empty.
+        """
+        if self._preset.initialisation is None:
+            raise MessageError(
+                f"{self._preset.name}: expected an [initialisation] table; got none; add it"
+            )
+        return self.update(self._preset.initialisation.target_switches)
+
+    def update(self, target_switches: int | None = None) -> UpdateReport:
+        """UpdatePNetwork(N): N sub-problems, each against a frozen target network.
+
+        A sub-problem is U epochs over shuffled minibatches. A memory of n samples has
+        floor(n / minibatch) of them in an epoch, as B = E / minibatch in algorithm 1 (450 / 32 is
+        14); the samples left over are others in each epoch. A memory that is smaller than a
+        minibatch is one smaller minibatch.
+
+        Source: algorithm 1.
+
+        Args:
+            target_switches: N; the preset's where None.
+
+        Raises:
+            MessageError: The memory is empty, or N is less than 1.
+        """
+        N = self._preset.schedule.target_switches if target_switches is None else target_switches
+        if N < 1:
+            raise MessageError(f"target_switches: expected at least 1; got {N}")
+        if len(self._memory) == 0:
+            raise MessageError("memory: expected samples to learn from; got none; add trajectories")
+        began_secs = time.perf_counter()
+        steps_before = self._counters.gradient_steps
+        losses, errors = [], []
+        assessment = self._assess()
+        for _ in range(N):
+            losses.append(self._solve_subproblem(assessment.teaching_signals))
+            targets = assessment.bellman_targets
+            assessment = self._assess()
+            errors.append(bellman_error(assessment.values, targets))
+        self._counters.updates += 1
+        return UpdateReport(
+            losses=tuple(loss.item() for loss in losses),
+            gradient_steps=self._counters.gradient_steps - steps_before,
+            mean_value=assessment.values.mean().item(),
+            mean_entropy=assessment.mean_entropy.item(),
+            bellman_error=sum(error.absolute.item() for error in errors) / N,
+            relative_bellman_error=sum(error.relative.item() for error in errors) / N,
+            secs=time.perf_counter() - began_secs,
+        )
+
+    def weights(self) -> dict[str, Tensor]:
+        """A copy of the network's weights, on the CPU."""
+        return {
+            name: tensor.detach().to("cpu", copy=True)
+            for name, tensor in self._network.state_dict().items()
+        }
+
+    def weights_bytes(self) -> bytes:
+        """The network's weights as a snapshot carries them."""
+        return weights_to_bytes(self._network.state_dict())
+
+    def get_state(self) -> TrainerState:
+        """A copy of everything that `set_state` needs to go on bit-identically."""
+        tensors = {f"memory.{name}": part for name, part in self._memory.get_state().items()}
+        for name, tensor in self._trained_tensors().items():
+            tensors[name] = tensor.detach().to("cpu", copy=True).contiguous()
+        tensors["shuffling"] = self._shuffling.get_state()
+        return TrainerState(tensors, asdict(self._counters))
+
+    def set_state(self, state: TrainerState) -> None:
+        """Goes back to what `get_state` gave.
+
+        Raises:
+            StorageError: The state is not one of a trainer with this preset.
+        """
+        tensors = dict(state.tensors)
+        memory = {
+            name.removeprefix("memory."): tensors.pop(name)
+            for name in list(tensors)
+            if name.startswith("memory.")
+        }
+        shuffling = tensors.pop("shuffling", None)
+        if shuffling is None or state.counters.keys() != asdict(self._counters).keys():
+            raise StorageError(
+                "trainer state: expected a shuffling state and the counters "
+                f"{', '.join(asdict(self._counters))}; got {', '.join(state.counters)}; the "
+                "checkpoint is of another version"
+            )
+        self._memory.check_valid(memory)
+        overwrite(self._trained_tensors(), tensors, "trainer state")
+        self._memory.set_state(memory)
+        self._shuffling.set_state(shuffling)
+        self._counters = _Counters(**state.counters)
+
+    def _trained_tensors(self) -> dict[str, Tensor]:
+        network = {f"network.{name}": part for name, part in self._network.named_parameters()}
+        optimiser = {
+            f"optimiser.{name}": part for name, part in named_state(self._optimiser, self._network)
+        }
+        return network | optimiser
+
+    def _solve_subproblem(self, teaching_signals: Tensor) -> Tensor:
+        """Makes U epochs against fixed teaching signals; returns the mean loss, f32[]."""
+        schedule = self._preset.schedule
+        self._counters.target_switches += 1
+        if schedule.subproblem_loss_threshold == 0:
+            return self._run_epochs(schedule.epochs, teaching_signals).mean()
+        losses = []
+        for _ in range(schedule.epochs):
+            losses.append(self._run_epochs(1, teaching_signals))
+            if losses[-1].mean().item() < schedule.subproblem_loss_threshold:
+                break
+        return torch.cat(losses).mean()
+
+    def _run_epochs(self, n_epochs: int, teaching_signals: Tensor) -> Tensor:
+        n_samples = len(self._memory)
+        batch_size = min(self._preset.schedule.minibatch_size, n_samples)
+        n_batches = n_samples // batch_size
+        orders = [
+            torch.randperm(n_samples, generator=self._shuffling)[: n_batches * batch_size]
+            for _ in range(n_epochs)
+        ]
+        self._counters.gradient_steps += n_epochs * n_batches
+        return self._steps.run(torch.cat(orders).view(-1, batch_size), teaching_signals)
+
+    @torch.no_grad()
+    def _assess(self) -> _Assessment:
+        algorithm, samples = self._preset.algorithm, self._memory.samples
+        preferences = self._evaluate_frames()
+        here, after = samples.positions, samples.positions + 1
+        if algorithm.method == "dqn":
+            epsilon = self._epsilon()
+            values = epsilon_greedy_value(preferences, epsilon)
+            best = preferences.amax(1)
+            signals = bellman_target(
+                samples.rewards, best[after], samples.terminated, algorithm.gamma
+            )
+            mean_entropy = epsilon_greedy_entropy(epsilon, preferences.shape[1])
+        else:
+            values = soft_value(preferences, algorithm.beta)
+            signals = dpn_teaching_signal(
+                preferences[here, samples.actions],
+                values[here],
+                samples.rewards,
+                values[after],
+                samples.terminated,
+                alpha=algorithm.alpha,
+                gamma=algorithm.gamma,
+            )
+            mean_entropy = entropy(preferences[here], algorithm.beta).mean()
+        targets = bellman_target(
+            samples.rewards, values[after], samples.terminated, algorithm.gamma
+        )
+        return _Assessment(signals, values[here], targets, mean_entropy)
+
+    def _evaluate_frames(self) -> Tensor:
+        """P(s, a) of every picture in the memory, f32[F, A]: each is s of one, s' of another."""
+        with self._numerics():
+            parts = [
+                self._network(self._memory.live_frames(start, start + _EVALUATED_AT_ONCE))
+                for start in range(0, self._memory.n_frames, _EVALUATED_AT_ONCE)
+            ]
+        return torch.cat(parts)
+
+    def _numerics(self) -> AbstractContextManager[None]:
+        is_cuda = self._memory.device.type == "cuda"
+        return exact_float32() if is_cuda else contextlib.nullcontext()
+
+    def _epsilon(self) -> float:
+        """Probability of a random action in the episode that acts on the updated network."""
+        exploration, schedule = self._preset.exploration, self._preset.schedule
+        assert exploration is not None  # the preset refuses DQN without it
+        per_update = 1 if schedule.update_every == "episode" else schedule.episodes_per_iteration
+        return exploration.epsilon((self._counters.updates + 1) * per_update)
+
+
+def _derived_seed(seed: int, stream: int) -> int:
+    sequence = np.random.SeedSequence(seed, spawn_key=(stream,))
+    return int(sequence.generate_state(1, np.uint64)[0])
