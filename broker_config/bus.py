@@ -7,43 +7,32 @@ decode is counted in `Bus.rejected` and dropped.
 
 from __future__ import annotations
 
+import atexit
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Protocol, Self, TypeVar
 
 import zenoh
 import zenoh.ext
 
 from broker_config.codec import decode, encode
-from broker_config.contract import Delivery, Quality, Row, check_sender, row_of
+from broker_config.contract import Delivery, Row, check_sender, row_of
 from broker_config.errors import BusError, MessageError
 from broker_config.keys import ParsedKey, RunKeys, parse_key
 from broker_config.latest import LatestReader
 from broker_config.liveliness import alive_on
 from broker_config.messages import Role
 from broker_config.pump import Channel, Declared, Pump
+from broker_config.quality import reliability, send_options
 from broker_config.queries import Handler, PendingReply, Responder, serve_one
 from broker_config.rejected import Rejected
 from broker_config.session import open_session
 
 M = TypeVar("M")
 Reply = TypeVar("Reply")
-
-_CONGESTION = {
-    "block": zenoh.CongestionControl.BLOCK,
-    "drop": zenoh.CongestionControl.DROP,
-}
-_PRIORITY = {
-    "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
-    "interactive_low": zenoh.Priority.INTERACTIVE_LOW,
-    "data_high": zenoh.Priority.DATA_HIGH,
-    "data": zenoh.Priority.DATA,
-    "data_low": zenoh.Priority.DATA_LOW,
-}
-_RELIABILITY = {True: zenoh.Reliability.RELIABLE, False: zenoh.Reliability.BEST_EFFORT}
 
 _WAITING_QUESTIONS = 16
 """Questions that wait for one server; more wait in the network, not in memory."""
@@ -117,6 +106,9 @@ class Bus:
         self._responders: weakref.WeakSet[Responder] = weakref.WeakSet()
         self._lock = threading.Lock()
         self._is_closed = False
+        # A process that ends without closing would otherwise abort: its threads are still inside
+        # Zenoh when the interpreter takes itself apart.
+        atexit.register(self.close)
 
     # Questions --------------------------------------------------------------------------------
 
@@ -170,7 +162,7 @@ class Bus:
                 timeout=timeout_secs,
                 # The first answer is handed on at once instead of after the last.
                 consolidation=zenoh.ConsolidationMode.NONE,
-                **_send_options(quality),
+                **send_options(quality),
             )
         except zenoh.ZError as error:
             raise _closed(key) from error
@@ -202,8 +194,8 @@ class Bus:
         row = _row_for(key, Delivery.BEST_EFFORT, Delivery.LIVELINESS)
         publisher = self._session.declare_publisher(
             key,
-            reliability=_RELIABILITY[row.quality.is_reliable],
-            **_send_options(row.quality),
+            reliability=reliability(row.quality),
+            **send_options(row.quality),
         )
         return self._own_publisher(key, row, publisher)
 
@@ -218,8 +210,8 @@ class Bus:
             sample_miss_detection=zenoh.ext.MissDetectionConfig(
                 heartbeat=_MISS_HEARTBEAT_SECS, sporadic_heartbeat=None
             ),
-            reliability=_RELIABILITY[row.quality.is_reliable],
-            **_send_options(row.quality),
+            reliability=reliability(row.quality),
+            **send_options(row.quality),
         )
         return self._own_publisher(key, row, publisher)
 
@@ -251,7 +243,7 @@ class Bus:
             reader.set(message)
 
         self._pump_samples(key, subscriber, subscriber.handler, message_type, keep)
-        self._declared.append(reader.close)
+        self._own(reader.close)
         return reader
 
     # Liveliness -------------------------------------------------------------------------------
@@ -259,7 +251,7 @@ class Bus:
     def declare_alive(self) -> None:
         """Shows that this process is attached, until the bus is closed or the process dies."""
         token = self._session.liveliness().declare_token(self._live_key)
-        self._declared.append(token.undeclare)
+        self._own(token.undeclare)
 
     def alive(self) -> list[ParsedKey]:
         """Which processes are attached to the run now.
@@ -298,6 +290,7 @@ class Bus:
             if self._is_closed:
                 return
             self._is_closed = True
+        atexit.unregister(self.close)
         for undeclare in reversed(self._declared):
             undeclare()
         for responder in list(self._responders):
@@ -318,10 +311,18 @@ class Bus:
         if self._is_closed:
             raise _closed(self._live_key)
 
+    def _own(self, undeclare: Callable[[], None]) -> None:
+        with self._lock:
+            if not self._is_closed:
+                self._declared.append(undeclare)
+                return
+        undeclare()
+        raise _closed(self._live_key)
+
     def _pump(
         self, name: str, declared: Declared, channel: Channel[M], take: Callable[[M], None]
     ) -> None:
-        self._declared.append(Pump(name, declared, channel, take).close)
+        self._own(Pump(name, declared, channel, take).close)
 
     def _pump_samples(
         self,
@@ -346,7 +347,7 @@ class Bus:
 
     def _own_publisher(self, key: str, row: Row, publisher: _Puts) -> Publisher:
         own = Publisher(key, row, publisher)
-        self._declared.append(own.undeclare)
+        self._own(own.undeclare)
         return own
 
 
@@ -385,14 +386,6 @@ def _row_for(key: str, *deliveries: Delivery) -> Row:
         wanted = " or ".join(deliveries)
         raise MessageError(f"{key}: expected a key for {wanted}; got one for {row.delivery}")
     return row
-
-
-def _send_options(quality: Quality) -> dict[str, Any]:
-    return {
-        "congestion_control": _CONGESTION[quality.congestion],
-        "priority": _PRIORITY[quality.priority],
-        "express": quality.is_express,
-    }
 
 
 def _closed(subject: str) -> BusError:

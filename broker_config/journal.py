@@ -42,6 +42,7 @@ _SCHEMA = Schema(
 _SELECT = "SELECT offset, name, payload FROM entries"
 _GROUP_ENTRIES, _GROUP_BYTES = 1000, 32 << 20
 """A commit takes no more than this, so that the first of a burst does not wait for the last."""
+_ITERATION_BYTES = 4 << 20
 _PENDING_BYTES = 128 << 20
 """More than this is not queued; `append` then waits for the disk."""
 
@@ -140,9 +141,13 @@ class JournalReader:
             return int(self._reader().execute(query).fetchone()[0])
 
     def __iter__(self) -> Iterator[JournalEntry]:
-        """All entries that there were when the iteration began, one in memory at a time."""
-        for offset in range(self.end_offset):
-            yield from self.read(offset, max_bytes=1)
+        """All entries that there were when the iteration began, a few in memory at a time."""
+        offset, end = 0, self.end_offset
+        while offset < end:
+            for entry in self.read(offset, _ITERATION_BYTES):
+                if entry.offset < end:
+                    yield entry
+                offset = entry.offset + 1
 
     def close(self) -> None:
         """Closes the file; a second call does nothing."""

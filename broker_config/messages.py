@@ -317,7 +317,9 @@ class Verdict(StrEnum):
     SPARE = "spare"
     """Sound, but another attempt of the ticket was complete first."""
     INVALID = "invalid"
-    """Guarded, or not what the ticket asked for; kept, never learned from."""
+    """Guarded, or of a wrong length; kept, never learned from. The ticket is issued again."""
+    UNASKED = "unasked"
+    """Of a ticket that was not issued like this; kept, and changes nothing."""
     LOST = "lost"
     """The actor vanished; the ticket is issued again."""
 

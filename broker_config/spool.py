@@ -7,10 +7,10 @@ trajectory. Everything is on the disk before a call returns.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -96,13 +96,13 @@ class Spool:
         self._incarnation = require_id("spool's incarnation", incarnation)
         self._max_bytes = max_bytes
         self._lock = threading.RLock()
-        self._file_lock = FileLock(path.with_name(path.name + ".lock"), f"spool {path}")
-        try:
+        with contextlib.ExitStack() as undo:
+            self._file_lock = FileLock(path.with_name(path.name + ".lock"), f"spool {path}")
+            undo.callback(self._file_lock.close)
             self._connection = open_database(path, _SCHEMA)
+            undo.callback(self._connection.close)
             self._claim()
-        except BaseException:
-            self._file_lock.close()
-            raise
+            undo.pop_all()
 
     def _claim(self) -> None:
         with storage_errors(_SCHEMA.subject, self._path), transaction(self._connection):
@@ -292,7 +292,7 @@ class Spool:
     ) -> None:
         self.close()
 
-    @contextmanager
+    @contextlib.contextmanager
     def _changing(self) -> Iterator[None]:
         with (
             self._lock,

@@ -127,7 +127,7 @@ def _convert_array(plain: object, path: str) -> object:
     if not isinstance(plain, dict) or plain.keys() != {"dtype", "shape", "data"}:
         raise _mismatch(path, "an array (dtype, shape, data)", plain)
     dtype, shape, data = plain["dtype"], plain["shape"], plain["data"]
-    if dtype not in _ARRAY_DTYPES:
+    if not isinstance(dtype, str) or dtype not in _ARRAY_DTYPES:
         raise _mismatch(f"{path}.dtype", "one of " + ", ".join(_ARRAY_DTYPES.values()), dtype)
     if not isinstance(shape, list) or not all(type(n) is int and n >= 0 for n in shape):
         raise _mismatch(f"{path}.shape", "a list of sizes", shape)

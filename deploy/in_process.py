@@ -18,6 +18,7 @@ from learner.snapshots import SnapshotStore
 
 ACTOR = "in-process"
 COMMIT_TIMEOUT_SECS = 60.0
+IDLE_SECS = 0.1
 
 
 class InProcessActor:
@@ -48,13 +49,16 @@ class InProcessActor:
 
     def play_until_ready(self, index: int) -> bool:
         """Plays one ticket if there is one to play; returns whether ticket `index` is ready."""
+        now_secs = time.monotonic()
+        self._owner.expire_leases(now_secs)  # what other actors of a resumed run had
         request = TicketRequest(ACTOR, self._incarnation, secrets.token_hex(8))
-        issued = self._owner.issue(request, time.monotonic())
-        if issued is not None:
-            reply, committed = issued
-            committed.result()
-            if reply.ticket is not None:
-                self._play(reply.ticket)
+        issued = self._owner.issue(request, now_secs)
+        if issued is None:
+            return self._owner.wait_ready(index, IDLE_SECS)
+        reply, committed = issued
+        committed.result()
+        if reply.ticket is not None:
+            self._play(reply.ticket)
         return self._owner.is_ready(index)
 
     def _play(self, ticket: Ticket) -> None:

@@ -182,8 +182,8 @@ class TicketBook:
     def _apply_ended(self, event: AttemptEnded) -> None:
         if event.trajectory is not None:
             self._verdicts[event.trajectory] = event.verdict
-        if event.ticket >= len(self._tickets):
-            return  # a trajectory for a ticket that was never issued: kept, but it changes nothing
+        if event.verdict is Verdict.UNASKED:
+            return
         state = self._tickets[event.ticket]
         self._outstanding.pop((event.ticket, event.attempt), None)
         match event.verdict:
@@ -240,14 +240,13 @@ class TicketBook:
 
     def _make_ticket(self, index: int) -> Ticket:
         state = self._tickets[index] if index < len(self._tickets) else _TicketState()
-        part = len(state.parts)
         exploration = self._preset.exploration
         is_dqn = self._preset.algorithm.method == "dqn"
         return Ticket(
             index=index,
             attempt=state.attempts,
-            part=part,
-            seed=derive_seed(self._preset.seed, index, state.generation, part),
+            part=len(state.parts),
+            seed=self._seed(index),
             policy_version=self._schedule.policy_version(index),
             steps=self._preset.task.horizon - state.steps,
             epsilon=exploration.epsilon(index) if is_dqn and exploration else 0.0,
@@ -255,17 +254,19 @@ class TicketBook:
 
     def _judge(self, trajectory: Trajectory) -> tuple[Verdict, str]:
         ticket, steps = trajectory.ticket, trajectory.steps
-        if ticket.index >= len(self._tickets):
-            return Verdict.INVALID, f"ticket {ticket.index} was never issued"
-        state = self._tickets[ticket.index]
+        state = self._tickets[ticket.index] if ticket.index < len(self._tickets) else _TicketState()
         if state.issued.get(ticket.attempt) != ticket:
-            return Verdict.INVALID, f"ticket {ticket.index} was not issued like this"
+            return Verdict.UNASKED, f"ticket {ticket.index} was not issued like this"
         if trajectory.guard is not None:
             return Verdict.INVALID, f"guard: {trajectory.guard}"
         ended_early = steps < ticket.steps and not trajectory.terminated
         if steps > ticket.steps or (ended_early and not trajectory.interrupted):
             return Verdict.INVALID, f"expected {ticket.steps} steps; got {steps}"
-        current = self._make_ticket(ticket.index)
-        if state.complete or (ticket.part, ticket.seed) != (current.part, current.seed):
+        is_current = (ticket.part, ticket.seed) == (len(state.parts), self._seed(ticket.index))
+        if state.complete or not is_current:
             return Verdict.SPARE, "another attempt was complete first"
         return Verdict.ACCEPTED, ""
+
+    def _seed(self, index: int) -> int:
+        state = self._tickets[index] if index < len(self._tickets) else _TicketState()
+        return derive_seed(self._preset.seed, index, state.generation, len(state.parts))

@@ -10,11 +10,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 
+import hypothesis
 import numpy as np
 import pytest
 
 from broker_config.bus import Bus, open_bus
 from broker_config.messages import Role, Ticket, Trajectory, TrajectoryId
+
+# A busy machine is no failure, and a test that passed passes again.
+hypothesis.settings.register_profile(
+    "clothbus",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("clothbus")
 
 _ROUTER = """
 import signal, sys
@@ -90,7 +100,7 @@ Attach = Callable[[Role, str], Bus]
 @pytest.fixture
 def run_name(request: pytest.FixtureRequest) -> str:
     """A run name that no other test uses."""
-    return request.node.name.lower().replace("[", "-").replace("]", "")[:64]
+    return str(request.node.name).lower().replace("[", "-").replace("]", "")[:64]
 
 
 @pytest.fixture

@@ -110,7 +110,7 @@ class PyBulletProcessEngine:
         )
         try:
             self._worker = subprocess.Popen(
-                [sys.executable, "-m", "actors.cloth.pybullet_worker"],
+                [sys.executable, "-P", "-m", "actors.cloth.pybullet_worker"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._complaints,

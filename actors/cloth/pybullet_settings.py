@@ -1,6 +1,6 @@
 """The numbers of PyBullet's cloth, apart from PyBullet itself.
 
-They are those with which a 12 x 12 handkerchief of 0.3 m survived hundreds of random actions.
+With them a 12 x 12 handkerchief of 0.3 m survived hundreds of random actions without exploding.
 Finer meshes need shorter time steps, because the springs are integrated explicitly.
 """
 
@@ -17,7 +17,10 @@ class PyBulletSettings:
     """At 1/240 the cloth exploded once in 200 actions, and an action took twice as long."""
 
     mass_kg: float = 0.05
-    elastic_stiffness: float = 40.0
+
+    elastic_stiffness: float = 80.0
+    """At 40, 5 of 100 random actions left an edge above 1.5 times its length; at 80, 2 of 240."""
+
     damping_stiffness: float = 0.1
 
     bending_stiffness: float = 1.0

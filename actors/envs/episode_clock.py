@@ -1,5 +1,7 @@
 """Counts the steps of an episode of fixed length."""
 
+from actors.envs.arguments import check_size
+
 
 class EpisodeClock:
     """Says when an episode is cut off, and refuses a step outside of an episode.
@@ -17,10 +19,7 @@ class EpisodeClock:
         Raises:
             ValueError: the horizon is not a positive integer.
         """
-        if not isinstance(horizon, int) or horizon < 1:
-            raise ValueError(
-                f"horizon: expected an integer of at least 1; got {horizon!r}; the source uses 30"
-            )
+        check_size("horizon", horizon, least=1)
         self.horizon = horizon
         self._remaining_steps = 0
 

@@ -100,7 +100,6 @@ def test_a_stopped_viewer_delays_nobody(router, run_name, attach, wait_until):
         for step in range(400):  # 20 MB: far more than the stopped viewer's buffers hold
             publisher.put(Metrics("actor", "a", step, numbers))
 
-
         def newest_arrives():
             publisher.put(Metrics("actor", "a", 400, {}))
             return steps and steps[-1] == 400

@@ -5,6 +5,7 @@ import time
 
 import pytest
 
+from broker_config.bus import Bus
 from broker_config.codec import encode
 from broker_config.errors import (
     BusError,
@@ -28,6 +29,7 @@ from broker_config.messages import (
     Trajectory,
     Verdict,
 )
+from broker_config.session import open_session
 
 REQUEST = TicketRequest("actor-01", "inc-1", "nonce-1")
 
@@ -219,3 +221,17 @@ def test_a_closed_bus_says_so(actor, ask_ticket):
     actor.close()
     with pytest.raises(BusError, match="expected an open bus"):
         ask_ticket()
+
+
+def test_what_is_declared_on_a_closed_bus_of_an_open_session_does_not_stay(router, run_name):
+    with open_session("client", router.address) as session:
+        bus = Bus(session, run_name, "owner", "learner")
+        bus.close()
+        for declare in (
+            bus.declare_alive,
+            lambda: bus.serve(bus.keys.control, Control, lambda *_: None),
+            lambda: bus.latest_publisher(bus.keys.policy),
+        ):
+            with pytest.raises(BusError, match="expected an open bus"):
+                declare()
+        assert Bus(session, run_name, "observer", "o").alive() == []

@@ -32,7 +32,7 @@ def test_a_drop_right_above_the_pick_still_makes_a_path() -> None:
 
 def test_only_the_top_layer_is_grasped() -> None:
     bottom = rectangular_sheet(12, 0.3).vertices_m
-    top = bottom + [0.01, 0.0, 0.02]
+    top = bottom + np.array([0.01, 0.0, 0.02])
     grasped = grasped_vertices(np.concatenate([bottom, top]), (0.0, 0.0))
     assert (grasped >= len(bottom)).all()
     assert 1 <= len(grasped) <= 4

@@ -8,7 +8,7 @@ SHEET = rectangular_sheet(12, 0.3)
 
 
 def test_a_flat_cloth_is_in_order() -> None:
-    assert guard(SHEET, SHEET.vertices_m + [0.1, -0.1, 0.003]) is None
+    assert guard(SHEET, SHEET.vertices_m + np.array([0.1, -0.1, 0.003])) is None
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -31,4 +31,4 @@ def test_one_edge_is_enough_to_be_overstretched() -> None:
     "shift_m", [[0.5, 0.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, -0.05], [0.0, 0.0, 0.7]]
 )
 def test_off_the_table(shift_m: list[float]) -> None:
-    assert guard(SHEET, SHEET.vertices_m + shift_m) is GuardReason.OFF_TABLE
+    assert guard(SHEET, SHEET.vertices_m + np.array(shift_m)) is GuardReason.OFF_TABLE

@@ -24,7 +24,7 @@ def test_an_unknown_id_names_the_known_ones() -> None:
 
 
 def test_an_unknown_argument_names_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="expected some of the arguments n_joints.*; got joints"):
+    with pytest.raises(ValueError, match=r"expected some of the arguments n_joints.*; got joints"):
         make_env("clothbus/Reaching-v0", joints=3)
 
 

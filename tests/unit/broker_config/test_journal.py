@@ -37,7 +37,10 @@ def test_entries_get_offsets_from_zero_and_are_read_back(path):
 def test_a_name_that_is_there_adds_nothing(path):
     with Journal(path) as journal:
         append(journal, "a", payload=b"first")
-        assert append(journal, "a", "b", payload=b"again") == (Appended(0, False), Appended(1, True))
+        assert append(journal, "a", "b", payload=b"again") == (
+            Appended(0, False),
+            Appended(1, True),
+        )
         assert append(journal, "c", "c")[1] == Appended(2, False)
         assert journal.find("a").payload == b"first"
         assert journal.end_offset == 3

@@ -1,0 +1,178 @@
+"""Runs of several methods on the same seeds, in parallel, interruptible, kept as JSON lines."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from broker_config.errors import MessageError, StorageError
+from broker_config.preset import Preset, preset_from_toml
+from broker_config.structure import from_plain, to_plain
+from deploy.reproduce.learning_curve import CurvePoint, InProcessRun
+from learner.checkpoint import CheckpointStore
+
+Method = Literal["dpn", "dueling-dpn", "dqn", "dueling-dqn"]
+Device = Literal["cpu", "cuda"]
+
+_OVERRIDES: dict[Method, tuple[str, ...]] = {
+    "dpn": ("algorithm.method=dpn", "algorithm.head=plain"),
+    "dueling-dpn": ("algorithm.method=dpn", "algorithm.head=dueling-penalty"),
+    "dqn": ("algorithm.method=dqn", "algorithm.head=plain"),
+    "dueling-dqn": ("algorithm.method=dqn", "algorithm.head=dueling-mean"),
+}
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """Names one run of a comparison."""
+
+    method: Method
+    seed: int
+    preset_digest: str
+    """Of the run's own preset, method and seed included."""
+
+    @property
+    def name(self) -> str:
+        """Short, and another for every setting."""
+        return f"{self.method}-{self.seed}-{self.preset_digest[:12]}"
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A learning curve and the run that it belongs to."""
+
+    key: RunKey
+    device: Device
+    points: tuple[CurvePoint, ...]
+
+
+def method_preset(name: str, overrides: Sequence[str], method: Method, seed: int) -> Preset:
+    """The preset of one run: a file of `deploy/presets`, changed.
+
+    Raises:
+        PresetError: The file or an override cannot be used.
+        StorageError: There is no such file.
+    """
+    path = resources.files("deploy") / "presets" / f"{name}.toml"
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise StorageError(
+            f"preset {name!r}: expected the name of a file in deploy/presets; got {error}"
+        ) from error
+    return preset_from_toml(text, (*overrides, *_OVERRIDES[method], f"seed={seed}"))
+
+
+def finish_runs(
+    presets: dict[RunKey, Preset], curves: Path, work: Path, device: Device, jobs: int
+) -> list[FinishedRun]:
+    """Makes the runs that are not in the file yet, and adds each to it when it is finished.
+
+    Args:
+        presets: The runs, in the order in which they are started.
+        curves: The file of JSON lines, one for each iteration of a finished run.
+        work: Folder of checkpoints: an unfinished run goes on from its last iteration.
+        device: What the learners compute on; actors act on the CPU.
+        jobs: Runs at a time, each in a process of its own with one thread.
+
+    Returns:
+        All runs asked for, in the order of `presets`.
+
+    Raises:
+        StorageError: The file cannot be read or written.
+    """
+    finished = {run.key: run for run in read_runs(curves)}
+    missing = {key: preset for key, preset in presets.items() if key not in finished}
+    for run in _run_side_by_side(missing, work, device, jobs):
+        finished[run.key] = run
+        write_runs(curves, finished.values())
+    return [finished[key] for key in presets]
+
+
+def _run_side_by_side(
+    presets: dict[RunKey, Preset], work: Path, device: Device, jobs: int
+) -> Iterator[FinishedRun]:
+    # A process for each run, and spawned: CUDA does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, max_tasks_per_child=1) as pool:
+        futures = [
+            pool.submit(_run, key, preset, work / key.name, device)
+            for key, preset in presets.items()
+        ]
+        try:
+            for future in as_completed(futures):
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # what has not begun does not begin
+            raise
+
+
+def _run(key: RunKey, preset: Preset, folder: Path, device: Device) -> FinishedRun:
+    torch.set_num_threads(1)
+    run = InProcessRun(preset, CheckpointStore(folder), device)
+    for point in run.finish():
+        line = (
+            f"{key.name}: iteration {point.iteration}, greedy {point.greedy_return:.2f}, "
+            f"training {point.training_return:.2f}, {point.gradient_steps} gradient steps, "
+            f"{point.secs:.1f} s\n"
+        )
+        sys.stderr.write(line)
+    return FinishedRun(key, device, tuple(run.points))
+
+
+def read_runs(path: Path) -> list[FinishedRun]:
+    """Reads what `write_runs` wrote; no runs where there is no file.
+
+    Raises:
+        StorageError: The file holds something else.
+    """
+    if not path.exists():
+        return []
+    curves: dict[tuple[RunKey, Device], list[CurvePoint]] = {}
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            row = from_plain(json.loads(line), _Row, f"{path.name}:{number}")
+        except (ValueError, MessageError) as error:
+            raise StorageError(
+                f"{path}: expected learning curves; got line {number}: {error}; move it away"
+            ) from error
+        curves.setdefault((row.run, row.device), []).append(row.point)
+    return [FinishedRun(key, device, tuple(points)) for (key, device), points in curves.items()]
+
+
+def write_runs(path: Path, runs: Iterable[FinishedRun]) -> None:
+    """Writes the runs' curves, ordered by method and seed; a reader sees the whole file or none.
+
+    Raises:
+        StorageError: The disk refuses.
+    """
+    ordered = sorted(runs, key=lambda run: (run.key.method, run.key.seed, run.key.preset_digest))
+    rows = [_Row(run.key, run.device, point) for run in ordered for point in run.points]
+    text = "".join(json.dumps(to_plain(row)) + "\n" for row in rows)
+    partial = path.with_suffix(".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("w") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: expected to write {len(rows)} lines; got {error}") from error
+
+
+@dataclass(frozen=True)
+class _Row:
+    run: RunKey
+    device: Device
+    point: CurvePoint

@@ -1,0 +1,140 @@
+"""One run in one process: collect, update, and the greedy policy's return after each iteration."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from actors.acting import Greedy, collecting_policy
+from actors.envs import ClothbusEnv, make_env
+from actors.policy import Policy
+from actors.rollout import ActingPolicy, Start, Step, rollout
+from broker_config.messages import Ticket
+from broker_config.preset import Preset
+from broker_config.structure import from_plain, to_plain
+from learner.checkpoint import CheckpointStore
+from learner.tickets import derive_seed
+from learner.trainer import Trainer, UpdateReport
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The state of a run after an iteration."""
+
+    iteration: int
+    """Counted from 1."""
+    samples: int
+    gradient_steps: int
+    greedy_return: float
+    """Return of one episode of the greedy policy, without discount."""
+    training_return: float
+    """Mean return of the iteration's episodes."""
+    loss: float
+    mean_value: float
+    bellman_error: float
+    relative_bellman_error: float
+    secs: float
+    """Wall time of the iteration."""
+
+
+class InProcessRun:
+    """A run whose episodes are those that tickets over the bus would ask for.
+
+    It checkpoints after every iteration, and goes on from there when it is made again. Tasks are
+    deterministic given the ticket, and policies trail by the preset's lag: a lag is refused here,
+    since nothing is collected side by side.
+    """
+
+    def __init__(self, preset: Preset, checkpoints: CheckpointStore, device: str = "cpu") -> None:
+        if preset.schedule.policy_lag != 0:
+            raise ValueError(
+                f"{preset.name}: expected schedule.policy_lag 0; got {preset.schedule.policy_lag}; "
+                "one process collects and trains in turn"
+            )
+        self._preset = preset
+        self._checkpoints = checkpoints
+        self._trainer = Trainer(preset, device)
+        self.points: list[CurvePoint] = []
+        if (checkpoint := checkpoints.latest()) is not None:
+            self._trainer.set_state(checkpoint.state)
+            self.points = [
+                from_plain(point, CurvePoint, "checkpoint.points")
+                for point in checkpoint.extra["points"]
+            ]
+
+    def finish(self) -> Iterator[CurvePoint]:
+        """Runs the iterations that are left; yields each once it is on disk."""
+        task = self._preset.task
+        env = make_env(task.environment, horizon=task.horizon, **task.options)
+        try:
+            while len(self.points) < self._preset.schedule.iterations:
+                self.points.append(self._iterate(env))
+                extra = {"points": [to_plain(point) for point in self.points]}
+                self._checkpoints.save(self._trainer.get_state(), extra)
+                yield self.points[-1]
+        finally:
+            env.close()
+
+    def _iterate(self, env: ClothbusEnv) -> CurvePoint:
+        began_secs = time.perf_counter()
+        schedule, n_before = self._preset.schedule, len(self.points)
+        first = n_before * schedule.episodes_per_iteration
+        returns: list[float] = []
+        report: UpdateReport | None = None
+        policy = self._policy()
+        for index in range(first, first + schedule.episodes_per_iteration):
+            acting = collecting_policy(self._preset.algorithm, policy)
+            returns.append(self._collect(env, acting, self._ticket(index)))
+            if schedule.updates_after(index):
+                report = self._trainer.update()
+                policy = self._policy()
+        assert report is not None  # an update ends every iteration
+        return CurvePoint(
+            iteration=n_before + 1,
+            samples=(n_before + 1) * schedule.episodes_per_iteration * self._preset.task.horizon,
+            gradient_steps=self._trainer.gradient_steps,
+            greedy_return=self._return(env, Greedy(policy)),
+            training_return=float(np.mean(returns)),
+            loss=report.loss,
+            mean_value=report.mean_value,
+            bellman_error=report.bellman_error,
+            relative_bellman_error=report.relative_bellman_error,
+            secs=time.perf_counter() - began_secs,
+        )
+
+    def _policy(self) -> Policy:
+        return Policy(self._preset.network, self._trainer.weights())
+
+    def _ticket(self, index: int) -> Ticket:
+        exploration = self._preset.exploration
+        explores = self._preset.algorithm.method == "dqn" and exploration is not None
+        return Ticket(
+            index=index,
+            attempt=0,
+            part=0,
+            seed=derive_seed(self._preset.seed, index, 0, 0),
+            policy_version=self._preset.schedule.policy_version(index),
+            steps=self._preset.task.horizon,
+            epsilon=exploration.epsilon(index) if exploration and explores else 0.0,
+        )
+
+    def _collect(self, env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> float:
+        """Plays an episode into the memory; returns its return."""
+        start, *rest = rollout(env, policy, ticket)
+        assert isinstance(start, Start)
+        steps = [step for step in rest if isinstance(step, Step)]
+        rewards = np.array([step.reward for step in steps], np.float32)
+        self._trainer.add(
+            np.stack([start.observation, *(step.observation for step in steps)]),
+            np.array([step.action for step in steps], np.int32),
+            rewards,
+            terminated=steps[-1].terminated,
+        )
+        return float(rewards.sum(dtype=np.float64))
+
+    def _return(self, env: ClothbusEnv, policy: ActingPolicy) -> float:
+        steps = rollout(env, policy, self._ticket(0))
+        return sum(step.reward for step in steps if isinstance(step, Step))

@@ -1,0 +1,248 @@
+"""The ticket book: who collects what, which attempt counts, and that replay gives the same book."""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+
+import numpy as np
+import pytest
+
+from broker_config.messages import (
+    AttemptEnded,
+    Ticket,
+    TicketIssued,
+    TicketRequest,
+    TicketReseeded,
+    Trajectory,
+    TrajectoryId,
+    Verdict,
+)
+from broker_config.preset import Preset
+from deploy.presets import load_preset
+from learner.tickets import (
+    INVALID_ATTEMPTS_BEFORE_RESEED,
+    LEASE_SECS,
+    LOST_ATTEMPTS_BEFORE_RESEED,
+    TicketBook,
+    TicketEvent,
+    derive_seed,
+)
+
+
+@pytest.fixture
+def preset() -> Preset:
+    return load_preset("reaching-smoke", ["task.horizon=4"])
+
+
+def ask(actor: str, incarnation: str = "first", nonce: str | None = None) -> TicketRequest:
+    return TicketRequest(actor, incarnation, nonce or secrets.token_hex(4))
+
+
+def trajectory(
+    ticket: Ticket, actor: str = "a", steps: int | None = None, sequence: int = 0, **changes: object
+) -> Trajectory:
+    steps = ticket.steps if steps is None else steps
+    whole = Trajectory(
+        id=TrajectoryId(actor, "first", sequence),
+        ticket=ticket,
+        observations=np.zeros((steps + 1, 84, 84, 1), np.uint8),
+        actions=np.zeros(steps, np.int32),
+        rewards=np.zeros(steps, np.float32),
+        terminated=False,
+        truncated=True,
+        success=False,
+        guard=None,
+        interrupted=False,
+        ended_unix_secs=0.0,
+    )
+    return dataclasses.replace(whole, **changes)  # type: ignore[arg-type]
+
+
+def issue(book: TicketBook, request: TicketRequest, version: int = 99) -> Ticket:
+    ticket, _ = book.issue(request, version, now_secs=0.0)
+    assert ticket is not None
+    return ticket
+
+
+def verdict_of(events: list[TicketEvent]) -> Verdict:
+    ended = events[0]
+    assert isinstance(ended, AttemptEnded)
+    return ended.verdict
+
+
+def test_actors_get_different_tickets_and_a_repeated_nonce_the_same(preset: Preset) -> None:
+    book = TicketBook(preset)
+    request = ask("a", nonce="once")
+    first = issue(book, request)
+    assert issue(book, ask("b")).index == first.index + 1
+    assert issue(book, request) == first
+
+
+def test_a_ticket_waits_for_exactly_its_policy_version(preset: Preset) -> None:
+    book = TicketBook(preset)
+    first = issue(book, ask("a"), version=0)
+    assert book.issue(ask("b"), 0, now_secs=0.0) == (None, [])
+    book.close(trajectory(first))
+    assert issue(book, ask("b"), version=1).policy_version == 1
+
+
+def test_a_policy_lag_lets_episodes_be_collected_side_by_side() -> None:
+    book = TicketBook(load_preset("reaching-smoke", ["schedule.policy_lag=2"]))
+    versions = [issue(book, ask(actor), version=0).policy_version for actor in "abc"]
+    assert versions == [0, 0, 0]
+    assert book.issue(ask("d"), 0, now_secs=0.0)[0] is None
+    assert issue(book, ask("d"), version=1).policy_version == 1
+
+
+def test_the_first_complete_attempt_counts_and_a_later_one_is_spare(preset: Preset) -> None:
+    book = TicketBook(preset)
+    slow = issue(book, ask("slow"))
+    book.expire(now_secs=0.0)
+    book.expire(now_secs=LEASE_SECS + 1)
+    quick = issue(book, ask("quick"), version=0)
+    assert (quick.index, quick.seed) == (slow.index, slow.seed)
+    assert quick.attempt == slow.attempt + 1
+    assert verdict_of(book.close(trajectory(slow, "slow"))) is Verdict.ACCEPTED
+    assert verdict_of(book.close(trajectory(quick, "quick"))) is Verdict.SPARE
+    assert book.parts(0) == (TrajectoryId("slow", "first", 0),)
+
+
+def test_heartbeats_keep_a_slow_actor_s_ticket(preset: Preset) -> None:
+    book = TicketBook(preset)
+    issue(book, ask("slow"))
+    for now_secs in range(0, 100, int(LEASE_SECS)):
+        book.heard("slow", "first", float(now_secs))
+        assert book.expire(float(now_secs)) == []
+
+
+def test_a_restarted_actor_loses_what_it_had(preset: Preset) -> None:
+    book = TicketBook(preset)
+    before = issue(book, ask("a", "first"))
+    ticket, events = book.issue(ask("a", "second"), 99, now_secs=0.0)
+    assert verdict_of(events) is Verdict.LOST
+    assert ticket is not None
+    assert (ticket.index, ticket.seed, ticket.attempt) == (before.index, before.seed, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"guard": "nan"}, "guard: nan"),
+        ({"steps": 3}, "expected 4 steps; got 3"),
+    ],
+)
+def test_invalid_attempts_are_not_learned_from(
+    preset: Preset, changes: dict[str, object], reason: str
+) -> None:
+    book = TicketBook(preset)
+    events = book.close(trajectory(issue(book, ask("a")), **changes))  # type: ignore[arg-type]
+    ended = events[0]
+    assert isinstance(ended, AttemptEnded)
+    assert (ended.verdict, ended.reason) == (Verdict.INVALID, reason)
+    assert not book.is_complete(0)
+    assert issue(book, ask("a")).attempt == 1
+
+
+def test_a_ticket_that_was_not_issued_like_this_changes_nothing(preset: Preset) -> None:
+    book = TicketBook(preset)
+    issued = issue(book, ask("a"))
+    for wrong in (
+        dataclasses.replace(issued, seed=issued.seed + 1),
+        dataclasses.replace(issued, policy_version=7),
+        dataclasses.replace(issued, attempt=5),
+        dataclasses.replace(issued, index=3),
+    ):
+        assert verdict_of(book.close(trajectory(wrong))) is Verdict.UNASKED
+    assert verdict_of(book.close(trajectory(issued))) is Verdict.ACCEPTED
+
+
+def test_a_seed_that_always_fails_is_replaced(preset: Preset) -> None:
+    book = TicketBook(preset)
+    seeds = []
+    for sequence in range(INVALID_ATTEMPTS_BEFORE_RESEED + 1):
+        ticket = issue(book, ask("a"))
+        seeds.append(ticket.seed)
+        events = book.close(trajectory(ticket, sequence=sequence, guard="over_stretch"))
+    assert len(set(seeds[:-1])) == 1
+    assert seeds[-1] == derive_seed(preset.seed, 0, generation=1, part=0) != seeds[0]
+    assert not any(isinstance(event, TicketReseeded) for event in events)
+
+
+def test_a_trajectory_of_a_replaced_seed_does_not_count(preset: Preset) -> None:
+    book = TicketBook(preset)
+    late = issue(book, ask("late"))
+    for sequence in range(INVALID_ATTEMPTS_BEFORE_RESEED):
+        wrong = trajectory(late, "late", sequence=sequence, guard="nan")
+        book.close(wrong)
+    assert verdict_of(book.close(trajectory(late, "late", sequence=9))) is Verdict.SPARE
+
+
+def test_kills_alone_replace_a_seed_only_after_many(preset: Preset) -> None:
+    book = TicketBook(preset)
+    seeds = [
+        issue(book, ask("a", f"life-{life}")).seed
+        for life in range(LOST_ATTEMPTS_BEFORE_RESEED + 1)
+    ]
+    assert len(set(seeds[:-1])) == 1
+    assert seeds[-1] != seeds[0]
+
+
+def test_an_interrupted_attempt_counts_and_the_rest_is_collected(preset: Preset) -> None:
+    book = TicketBook(preset)
+    first = issue(book, ask("robot"))
+    part = trajectory(first, "robot", steps=3, interrupted=True)
+    assert verdict_of(book.close(part)) is Verdict.ACCEPTED
+    assert not book.is_complete(0)
+    rest = issue(book, ask("robot"))
+    assert (rest.index, rest.part, rest.steps) == (0, 1, 1)
+    assert rest.seed != first.seed
+    book.close(trajectory(rest, "robot", sequence=1))
+    assert book.is_complete(0)
+    assert [part.sequence for part in book.parts(0)] == [0, 1]
+
+
+def test_a_run_ends_when_every_ticket_is_complete(preset: Preset) -> None:
+    book = TicketBook(preset)
+    for sequence in range(preset.schedule.episodes):
+        assert not book.all_complete
+        book.close(trajectory(issue(book, ask("a")), sequence=sequence))
+    assert book.all_complete
+    assert book.issue(ask("a"), 99, now_secs=0.0)[0] is None
+
+
+def test_dqn_tickets_carry_the_falling_epsilon() -> None:
+    book = TicketBook(load_preset("reaching-smoke", ["algorithm.method=dqn"]))
+    epsilons = []
+    for sequence in range(4):
+        ticket = issue(book, ask("a"))
+        epsilons.append(ticket.epsilon)
+        book.close(trajectory(ticket, steps=10, sequence=sequence))
+    assert epsilons == pytest.approx([1.0, 0.55, 0.1, 0.1])
+
+
+def test_replaying_the_events_gives_the_same_book(preset: Preset) -> None:
+    book, events = TicketBook(preset), list[TicketEvent]()
+    generator = np.random.default_rng(0)
+    held: list[Ticket] = []
+    for number in range(200):
+        now_secs = float(number)
+        events += book.expire(now_secs)
+        if held and generator.random() < 0.5:
+            ticket = held.pop(int(generator.integers(len(held))))
+            guard = "nan" if generator.random() < 0.5 else None
+            events += book.close(trajectory(ticket, sequence=number, guard=guard))
+        else:
+            request = ask(f"actor-{generator.integers(3)}", f"life-{generator.integers(3)}")
+            new, more = book.issue(request, 99, now_secs)
+            events += more
+            held += [new] if new else []
+    replayed = TicketBook(preset)
+    for event in events:
+        replayed.apply(event)
+    assert {type(event) for event in events} == {TicketIssued, AttemptEnded, TicketReseeded}
+    assert replayed.all_complete == book.all_complete
+    for index in range(preset.schedule.episodes):
+        assert replayed.is_complete(index) == book.is_complete(index)
+    request = ask("actor-0", "new", nonce="same")
+    assert replayed.issue(request, 99, 1e6)[0] == book.issue(request, 99, 1e6)[0]
