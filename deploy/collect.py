@@ -11,12 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from actors.demonstrate.scripted import ImperfectScript
+from actors.demonstrate.acting import scripted_demonstrator
 
 from actors.acting import UniformlyRandom
 from actors.envs import ClothbusEnv
 from actors.rollout import ActingPolicy
 from actors.service import make_task_env
+from broker_config.errors import PresetError
 from broker_config.journal import Journal
 from broker_config.messages import SnapshotTaken, Trajectory
 from broker_config.ownership import own_run
@@ -79,4 +80,7 @@ def _policy(
 ) -> ActingPolicy:
     if demonstrator == "random":
         return UniformlyRandom(preset.task.n_actions)
-    return ImperfectScript(env, random_rate)
+    try:
+        return scripted_demonstrator(env, preset.task.n_actions, random_rate)
+    except ValueError as error:
+        raise PresetError(f"{preset.name}: {error}; collect with --demonstrator random") from error

@@ -117,6 +117,9 @@ class HandkerchiefFlipEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex]):
         check_range("start_turn_rad", start_turn_rad, 0.0, np.pi)
         check_render_mode(render_mode)
         self.render_mode = render_mode
+        self.pick_rule: PickRule = pick_rule
+        self.cloth_size_m = cloth_size_m
+        self.view_half_width_m = view_half_width_m
         self._pick_points, n_pick_points = PICK_RULES[pick_rule]
         self._n_actions = n_pick_points * len(DROP_POINTS_M)
         self._clock = EpisodeClock(horizon)

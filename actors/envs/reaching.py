@@ -101,6 +101,11 @@ class ReachingEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex]):
         reward = float(reaching_reward(end_effector_m(self._joint_angles_rad)))
         return self._observation(), reward, False, self._clock.tick(), self._info()
 
+    @property
+    def joint_angles_rad(self) -> NDArray[np.float64]:
+        """Of each joint relative to the limb before it, f64[n]: what a scripted expert may see."""
+        return self._joint_angles_rad.copy()
+
     def render(self) -> NDArray[np.uint8] | None:
         """The picture in colour, u8[render_px, render_px, 3]; None without a render mode."""
         if self.render_mode is None:

@@ -1,0 +1,200 @@
+"""The owner: what is told is in the journal, and a restart knows all that was told."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from broker_config.codec import SCHEMA_VERSION, decode, encode
+from broker_config.errors import MessageError, StorageError
+from broker_config.journal import Journal
+from broker_config.messages import (
+    Ack,
+    Attach,
+    Command,
+    Control,
+    Instruction,
+    Refusal,
+    SnapshotTaken,
+    TicketReply,
+    TicketRequest,
+    Trajectory,
+    TrajectoryId,
+    Verdict,
+    Welcome,
+)
+from broker_config.preset import Preset
+from broker_config.version import VERSION
+from deploy.presets import load_preset
+from learner.owner import Owner
+from learner.recorded import accepted_trajectories
+
+PRESET = load_preset("reaching-smoke", ["task.horizon=3"])
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[Journal]:
+    with Journal(tmp_path / "journal.sqlite") as opened:
+        yield opened
+
+
+def own(journal: Journal, preset: Preset = PRESET, version: int = 0) -> Owner:
+    owner = Owner("run", preset, journal)
+    owner.policy_ready(SnapshotTaken(version, "ab" * 32, 0))
+    return owner
+
+
+def ask(owner: Owner, actor: str = "a", nonce: str = "n", life: str = "life") -> TicketReply | None:
+    issued = owner.issue(TicketRequest(actor, life, nonce), now_secs=0.0)
+    if issued is None:
+        return None
+    reply, committed = issued
+    committed.result(10)
+    return reply
+
+
+def play(reply: TicketReply | None, sequence: int = 0) -> Trajectory:
+    assert reply is not None
+    assert reply.ticket is not None
+    steps = reply.ticket.steps
+    return Trajectory(
+        id=TrajectoryId("a", "life", sequence),
+        ticket=reply.ticket,
+        observations=np.full((steps + 1, 84, 84, 1), sequence, np.uint8),
+        actions=np.zeros(steps, np.int32),
+        rewards=np.ones(steps, np.float32),
+        terminated=False,
+        truncated=True,
+        success=True,
+        guard=None,
+        interrupted=False,
+        ended_unix_secs=0.0,
+    )
+
+
+def deliver(owner: Owner, trajectory: Trajectory) -> Ack:
+    acks: list[Ack] = []
+    arrived = threading.Event()
+
+    def committed(ack: Ack) -> None:
+        acks.append(ack)
+        arrived.set()
+
+    owner.receive(trajectory, encode(trajectory), committed)
+    assert arrived.wait(10)
+    return acks[0]
+
+
+def test_an_acked_trajectory_is_in_the_journal(journal: Journal) -> None:
+    owner = own(journal)
+    sent = play(ask(owner))
+    ack = deliver(owner, sent)
+    assert (ack.id, ack.verdict, ack.duplicate) == (sent.id, Verdict.ACCEPTED, False)
+    stored = journal.read(ack.offset, 1)[0]
+    assert stored.name == f"trajectory/{sent.id}"
+    assert encode(decode(stored.payload, Trajectory)) == encode(sent)
+    assert owner.is_ready(0)
+
+
+def test_a_resend_is_acked_again_and_counts_once(journal: Journal) -> None:
+    owner = own(journal)
+    sent = play(ask(owner))
+    first, again = deliver(owner, sent), deliver(owner, sent)
+    assert (again.offset, again.verdict, again.duplicate) == (first.offset, first.verdict, True)
+    assert len(list(accepted_trajectories(journal))) == 1
+
+
+def test_a_resend_after_the_owner_s_restart_counts_once(journal: Journal) -> None:
+    sent = play(ask(own(journal)))
+    deliver(Owner("run", PRESET, journal), sent)
+    restarted = own(journal)
+    assert restarted.epoch == 3
+    again = deliver(restarted, sent)
+    assert (again.duplicate, again.owner_epoch) == (True, restarted.epoch)
+    assert restarted.is_ready(0)
+    assert [item.id for item in restarted.trajectories(0)] == [sent.id]
+
+
+def test_a_nonce_gets_the_same_ticket_from_the_next_owner(journal: Journal) -> None:
+    before = ask(own(journal))
+    after = ask(own(journal))
+    assert before is not None
+    assert after is not None
+    assert before.ticket == after.ticket
+
+
+def test_what_the_network_cannot_learn_from_is_refused_and_not_kept(journal: Journal) -> None:
+    owner = own(journal)
+    sent = play(ask(owner))
+    wrong = dataclasses.replace(sent, observations=np.zeros((4, 84, 84, 3), np.uint8))
+    with pytest.raises(MessageError, match=r"uint8 \[T\+1, 84, 84, 1\].*\[4, 84, 84, 3\] from a"):
+        owner.receive(wrong, encode(wrong), lambda _: None)
+    beyond = dataclasses.replace(sent, actions=np.full(3, 10, np.int32))
+    with pytest.raises(MessageError, match="below 10; got 10 from a"):
+        owner.receive(beyond, encode(beyond), lambda _: None)
+    assert journal.entries(prefix="trajectory/") == []
+
+
+def test_a_journal_of_another_preset_is_refused(journal: Journal) -> None:
+    own(journal)
+    with pytest.raises(StorageError, match="another preset"):
+        own(journal, dataclasses.replace(PRESET, seed=7))
+
+
+def test_a_failing_journal_stops_the_run_and_acks_nothing(journal: Journal) -> None:
+    owner = own(journal)
+    sent = play(ask(owner))
+    journal.close()
+    with pytest.raises(StorageError):
+        owner.receive(sent, encode(sent), lambda _: pytest.fail("acked"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "subject"),
+    [
+        ({"schema_version": SCHEMA_VERSION + 1}, "schema version"),
+        ({"software_version": "0.0.1"}, "clothbus version"),
+        ({"preset_digest": "00" * 32}, "preset digest"),
+    ],
+)
+def test_attaching_with_something_else_is_refused_with_both_values(
+    journal: Journal, changes: dict[str, object], subject: str
+) -> None:
+    owner = own(journal)
+    request = Attach("actor", "a", "life", SCHEMA_VERSION, VERSION, PRESET.digest)
+    assert owner.attach(request) == Welcome("run", owner.epoch, PRESET.to_json())
+    refusal = owner.attach(dataclasses.replace(request, **changes))  # type: ignore[arg-type]
+    assert isinstance(refusal, Refusal)
+    assert refusal.subject == subject
+    assert refusal.got == str(next(iter(changes.values())))
+    assert refusal.expected != refusal.got
+
+
+def test_pause_resume_drain_and_stop_reach_actors_through_tickets(journal: Journal) -> None:
+    owner = own(journal)
+
+    def instruction(actor: str = "a") -> Instruction | None:
+        reply = ask(owner, actor, nonce="n" + actor)
+        return reply.instruction if reply else None
+
+    assert owner.control(Control(Command.PAUSE)).state == "paused"
+    assert instruction() is Instruction.WAIT
+    assert owner.control(Control(Command.RESUME)).state == "running"
+    assert instruction() is Instruction.COLLECT
+    owner.control(Control(Command.DRAIN, "b"))
+    assert instruction("b") is Instruction.DRAIN
+    assert instruction() is Instruction.COLLECT
+    assert owner.control(Control(Command.STOP)).state == "stopping"
+    assert instruction() is Instruction.STOP
+
+
+def test_a_pause_outlives_the_owner(journal: Journal) -> None:
+    own(journal).control(Control(Command.PAUSE))
+    reply = ask(own(journal))
+    assert reply is not None
+    assert reply.instruction is Instruction.WAIT
