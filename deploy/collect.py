@@ -11,9 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
-from actors.demonstrate.acting import scripted_demonstrator
-
 from actors.acting import UniformlyRandom
+from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import ClothbusEnv
 from actors.rollout import ActingPolicy
 from actors.service import make_task_env
