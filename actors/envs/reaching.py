@@ -37,6 +37,7 @@ class ReachingEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex]):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
+    action_space: gymnasium.spaces.Discrete
 
     def __init__(
         self,
