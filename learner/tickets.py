@@ -25,7 +25,9 @@ from broker_config.preset import Preset
 
 TicketEvent = TicketIssued | AttemptEnded | TicketReseeded
 
-INVALID_ATTEMPTS_BEFORE_RESEED = 3
+INVALID_ATTEMPTS_BEFORE_RESEED = 1
+"""Simulators are deterministic: a seed that the guard has ended once would end so each time."""
+
 LOST_ATTEMPTS_BEFORE_RESEED = 10
 """Kills are not the seed's fault, but a seed that always kills the actor must not stop the run."""
 

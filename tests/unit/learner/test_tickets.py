@@ -21,7 +21,6 @@ from broker_config.messages import (
 from broker_config.preset import Preset
 from deploy.presets import load_preset
 from learner.tickets import (
-    INVALID_ATTEMPTS_BEFORE_RESEED,
     LEASE_SECS,
     LOST_ATTEMPTS_BEFORE_RESEED,
     TicketBook,
@@ -157,24 +156,21 @@ def test_a_ticket_that_was_not_issued_like_this_changes_nothing(preset: Preset) 
     assert verdict_of(book.close(trajectory(issued))) is Verdict.ACCEPTED
 
 
-def test_a_seed_that_always_fails_is_replaced(preset: Preset) -> None:
+def test_a_seed_that_the_guard_ends_is_replaced(preset: Preset) -> None:
     book = TicketBook(preset)
     seeds = []
-    for sequence in range(INVALID_ATTEMPTS_BEFORE_RESEED + 1):
+    for generation in range(3):
         ticket = issue(book, ask("a"))
+        assert ticket.seed == derive_seed(preset.seed, 0, generation, part=0)
         seeds.append(ticket.seed)
-        events = book.close(trajectory(ticket, sequence=sequence, guard="over_stretch"))
-    assert len(set(seeds[:-1])) == 1
-    assert seeds[-1] == derive_seed(preset.seed, 0, generation=1, part=0) != seeds[0]
-    assert not any(isinstance(event, TicketReseeded) for event in events)
+        book.close(trajectory(ticket, sequence=generation, guard="overstretched"))
+    assert len(set(seeds)) == 3
 
 
 def test_a_trajectory_of_a_replaced_seed_does_not_count(preset: Preset) -> None:
     book = TicketBook(preset)
     late = issue(book, ask("late"))
-    for sequence in range(INVALID_ATTEMPTS_BEFORE_RESEED):
-        wrong = trajectory(late, "late", sequence=sequence, guard="nan")
-        book.close(wrong)
+    book.close(trajectory(late, "late", sequence=0, guard="nan"))
     assert verdict_of(book.close(trajectory(late, "late", sequence=9))) is Verdict.SPARE
 
 
