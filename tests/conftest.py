@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 import hypothesis
 import numpy as np
 import pytest
+import torch
 
 from broker_config.bus import Bus, open_bus
 from broker_config.messages import Role, Ticket, Trajectory, TrajectoryId
@@ -25,6 +26,8 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("clothbus")
+
+torch.set_num_threads(1)  # as in every clothbus process; more would wait for each other
 
 _ROUTER = """
 import signal, sys
