@@ -14,7 +14,7 @@ from broker_config.errors import ClothbusError, PresetError
 from broker_config.messages import Command
 from broker_config.preset import Preset
 from broker_config.session import DEFAULT_ADDRESS
-from deploy.process import CONFIGURATION_EXIT, end_with_parent, log_to_stderr
+from deploy.process import CONFIGURATION_EXIT, end_with_supervisor, log_to_stderr
 
 # What a command needs beyond this is imported when it runs: `clothbus status` shall not wait for
 # torch and a physics engine.
@@ -310,7 +310,7 @@ def _only_run(address: str, zenoh: tuple[str, ...]) -> str:
 
 def main() -> None:
     """Runs the command; errors that clothbus raises on purpose are one line, not a traceback."""
-    end_with_parent()
+    end_with_supervisor()
     log_to_stderr()
     try:
         app.cli(prog="clothbus", description="Teach robots to handle cloth, over a message bus.")

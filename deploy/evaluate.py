@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
@@ -21,7 +22,7 @@ from actors.service import make_task_env
 from broker_config.errors import StorageError
 from broker_config.messages import Ticket, TrajectoryId
 from broker_config.preset import Preset
-from deploy.process import use_one_torch_thread
+from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore
 from learner.tickets import derive_seed
@@ -79,7 +80,10 @@ def evaluate(
     chosen = versions or _first_and_last(folder)
     tasks = [(version, episode) for version in chosen for episode in range(episodes)]
     with ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), _prepare, (folder.path, preset, mode)
+        jobs,
+        multiprocessing.get_context("spawn"),
+        _prepare,
+        (os.getpid(), folder.path, preset, mode),
     ) as pool:
         results = list(pool.map(_play, tasks))
     scores = []
@@ -183,7 +187,8 @@ _worker: list[_Worker] = []
 """The one worker of this process, put there by `_prepare`."""
 
 
-def _prepare(folder: Path, preset: Preset, mode: Mode) -> None:
+def _prepare(parent_pid: int, folder: Path, preset: Preset, mode: Mode) -> None:
+    end_with_parent(parent_pid)
     _worker.append(_Worker(folder, preset, mode))
 
 

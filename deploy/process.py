@@ -25,14 +25,19 @@ def child_environment() -> Mapping[str, str]:
     return {**os.environ, **single, PARENT_VARIABLE: str(os.getpid())}
 
 
-def end_with_parent() -> None:
-    """Has the kernel terminate this process when its supervisor dies (Linux)."""
-    parent = os.environ.get(PARENT_VARIABLE)
-    if parent is None or sys.platform != "linux":
+def end_with_supervisor() -> None:
+    """Ends this process with the one that `child_environment` named, if there is one."""
+    if (supervisor := os.environ.get(PARENT_VARIABLE)) is not None:
+        end_with_parent(int(supervisor))
+
+
+def end_with_parent(parent_pid: int) -> None:
+    """Has the kernel terminate this process when its parent dies, however it dies (Linux)."""
+    if sys.platform != "linux":
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):  # it died before we asked
-        sys.exit(f"clothbus: supervisor {parent} is gone")
+    if os.getppid() != parent_pid:  # it died before we asked
+        sys.exit(f"clothbus: parent process {parent_pid} is gone")
 
 
 def on_terminate(handler: Callable[[], None]) -> None:

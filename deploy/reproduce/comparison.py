@@ -9,15 +9,16 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Literal
 
 import torch
 
 from broker_config.errors import MessageError, StorageError
-from broker_config.preset import Preset, preset_from_toml
+from broker_config.preset import Preset
 from broker_config.structure import from_plain, to_plain
+from deploy.presets import load_preset
+from deploy.process import end_with_parent
 from deploy.reproduce.learning_curve import CurvePoint, InProcessRun
 from learner.checkpoint import CheckpointStore
 
@@ -60,17 +61,9 @@ def method_preset(name: str, overrides: Sequence[str], method: Method, seed: int
     """The preset of one run: a file of `deploy/presets`, changed.
 
     Raises:
-        PresetError: The file or an override cannot be used.
-        StorageError: There is no such file.
+        PresetError: There is no such preset, or an override cannot be used.
     """
-    path = resources.files("deploy") / "presets" / f"{name}.toml"
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise StorageError(
-            f"preset {name!r}: expected the name of a file in deploy/presets; got {error}"
-        ) from error
-    return preset_from_toml(text, (*overrides, *_OVERRIDES[method], f"seed={seed}"))
+    return load_preset(name, (*overrides, *_OVERRIDES[method], f"seed={seed}"))
 
 
 def finish_runs(
@@ -104,7 +97,9 @@ def _run_side_by_side(
 ) -> Iterator[FinishedRun]:
     # A process for each run, and spawned: CUDA does not survive a fork.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(
+        jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
+    ) as pool:
         futures = [
             pool.submit(_run, key, preset, work / key.name, device)
             for key, preset in presets.items()

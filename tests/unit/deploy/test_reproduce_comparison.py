@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from broker_config.errors import StorageError
+from broker_config.errors import PresetError, StorageError
 from broker_config.preset import Preset
 from deploy.reproduce.comparison import (
     FinishedRun,
@@ -66,7 +66,7 @@ def test_a_policy_lag_is_refused(tmp_path: Path) -> None:
 
 
 def test_there_must_be_such_a_preset() -> None:
-    with pytest.raises(StorageError, match="preset 'nothing'"):
+    with pytest.raises(PresetError, match="preset nothing"):
         method_preset("nothing", (), "dpn", 0)
 
 
