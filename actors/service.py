@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from actors.acting import collecting_policy
 from actors.delivery import Delivery, wait_until
-from actors.envs import ClothbusEnv, make_env
+from actors.envs import ClothbusEnv
 from actors.policy import Policy
 from actors.rollout import (
     ActingPolicy,
@@ -20,9 +20,10 @@ from actors.rollout import (
     rollout,
     to_trajectory,
 )
+from actors.task import make_task_env
 from broker_config.bus import Bus
 from broker_config.codec import SCHEMA_VERSION
-from broker_config.errors import AttachRefused, OwnerUnreachable, PresetError, Refused
+from broker_config.errors import AttachRefused, OwnerUnreachable, Refused
 from broker_config.heart import Heart
 from broker_config.messages import (
     Attach,
@@ -34,7 +35,7 @@ from broker_config.messages import (
     TicketRequest,
     Welcome,
 )
-from broker_config.preset import Preset, TaskPreset, preset_from_json
+from broker_config.preset import Preset, preset_from_json
 from broker_config.spool import Spool
 from broker_config.version import VERSION
 
@@ -57,27 +58,6 @@ FLUSH_AT_END_SECS = 60.0
 
 class StopRequested(Exception):
     """The process was asked to leave in the middle of something."""
-
-
-def make_task_env(task: TaskPreset) -> ClothbusEnv:
-    """The preset's environment, checked against the shapes that the preset promises.
-
-    Raises:
-        PresetError: Environment and preset disagree.
-    """
-    try:
-        env = make_env(task.environment, horizon=task.horizon, **task.options)
-    except ValueError as error:
-        raise PresetError(f"task: {error}") from error
-    space, actions = env.observation_space, env.action_space
-    got = (tuple(space.shape or ()), int(getattr(actions, "n", 0)))
-    if got != (tuple(task.observation_shape), task.n_actions):
-        env.close()
-        raise PresetError(
-            f"{task.environment}: expected observations {list(task.observation_shape)} and "
-            f"{task.n_actions} actions (preset); got {list(got[0])} and {got[1]}; correct it"
-        )
-    return env
 
 
 class Actor:

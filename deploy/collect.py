@@ -15,7 +15,7 @@ from actors.acting import UniformlyRandom
 from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import ClothbusEnv
 from actors.rollout import ActingPolicy
-from actors.service import make_task_env
+from actors.task import make_task_env
 from broker_config.errors import PresetError
 from broker_config.journal import Journal
 from broker_config.messages import SnapshotTaken, Trajectory

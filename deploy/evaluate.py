@@ -18,7 +18,7 @@ from actors.acting import Greedy, Sampled
 from actors.envs import ClothbusEnv
 from actors.policy import Policy
 from actors.rollout import ActingPolicy, collect
-from actors.service import make_task_env
+from actors.task import make_task_env
 from broker_config.errors import StorageError
 from broker_config.messages import Ticket, TrajectoryId
 from broker_config.preset import Preset

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from actors.service import make_task_env
 from actors.step_log import StepLog
+from actors.task import make_task_env
 from broker_config.bus import open_bus
 from broker_config.journal import Journal
 from broker_config.messages import Metrics

@@ -56,6 +56,16 @@ class FinishedRun:
     device: Device
     points: tuple[CurvePoint, ...]
 
+    @property
+    def samples(self) -> list[int]:
+        """Samples at each update."""
+        return [samples for point in self.points for samples in point.updated_at]
+
+    @property
+    def greedy_returns(self) -> list[float]:
+        """Of the policy after each update."""
+        return [value for point in self.points for value in point.greedy_returns]
+
 
 def method_preset(name: str, overrides: Sequence[str], method: Method, seed: int) -> Preset:
     """The preset of one run: a file of `deploy/presets`, changed.

@@ -50,13 +50,7 @@ class Comparison:
 
     def areas(self, method: Method) -> list[float]:
         """Area under the greedy curve of each seed."""
-        return [
-            area_under_curve(
-                [point.samples for point in run.points],
-                [point.greedy_return for point in run.points],
-            )
-            for run in self.runs[method]
-        ]
+        return [area_under_curve(run.samples, run.greedy_returns) for run in self.runs[method]]
 
     def difference(self, other: Method) -> PairedDifference:
         """The subject's areas minus the other's."""
@@ -67,8 +61,8 @@ def draw_figure(path: Path, comparison: Comparison) -> None:
     """Draws each seed's greedy returns and each method's median over samples, as a PNG."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     for method, runs in comparison.runs.items():
-        curves = np.array([[point.greedy_return for point in run.points] for run in runs])
-        samples = [point.samples for point in runs[0].points]
+        curves = np.array([run.greedy_returns for run in runs])
+        samples = runs[0].samples
         for curve in curves:
             axes.plot(samples, curve, color=_COLOURS[method], alpha=0.25, linewidth=1)
         label = f"{_LABELS[method]}: median of {len(runs)} seeds"
@@ -118,7 +112,7 @@ def _areas_table(comparison: Comparison) -> str:
     for method in methods:
         runs = zip(comparison.areas(method), comparison.runs[method], strict=True)
         for row, (area, run) in zip(rows, runs, strict=True):
-            row += [f"{area:.2f}", f"{run.points[-1].greedy_return:.2f}"]
+            row += [f"{area:.2f}", f"{run.greedy_returns[-1]:.2f}"]
     header = ["seed"]
     for method in methods:
         header += [f"{_LABELS[method]}, area", "last return"]
@@ -153,7 +147,7 @@ def _settings(comparison: Comparison) -> str:
         f"{schedule.epochs}, minibatches of {schedule.minibatch_size}, an update every "
         f"{schedule.update_every}, {optimiser.name} {optimiser.learning_rate:g}.",
         "* The area is the mean greedy return over the samples, by trapezia from the first "
-        "iteration to the last. One greedy episode after each iteration is exact: the task is "
+        "update to the last. One greedy episode after each update is exact: the task is "
         "deterministic.",
         "* Seeds are paired: initial weights, minibatches and the episodes' random numbers are "
         "derived from them. All runs are shown, and each run's last policy counts, not its best.",

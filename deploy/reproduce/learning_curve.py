@@ -1,4 +1,4 @@
-"""One run in one process: collect, update, and the greedy policy's return after each iteration."""
+"""One run in one process: collect, update, and the greedy policy's return after each update."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ class CurvePoint:
     """Counted from 1."""
     samples: int
     gradient_steps: int
-    greedy_return: float
-    """Return of one episode of the greedy policy, without discount."""
+    updated_at: tuple[int, ...]
+    """Samples of the run at each update of the iteration."""
+    greedy_returns: tuple[float, ...]
+    """Return of one episode of the greedy policy after each of these updates, without discount."""
     training_return: float
     """Mean return of the iteration's episodes."""
     loss: float
@@ -38,6 +40,11 @@ class CurvePoint:
     relative_bellman_error: float
     secs: float
     """Wall time of the iteration."""
+
+    @property
+    def greedy_return(self) -> float:
+        """Of the iteration's last policy."""
+        return self.greedy_returns[-1]
 
 
 class InProcessRun:
@@ -83,6 +90,8 @@ class InProcessRun:
         schedule, n_before = self._preset.schedule, len(self.points)
         first = n_before * schedule.episodes_per_iteration
         returns: list[float] = []
+        updated_at: list[int] = []
+        greedy_returns: list[float] = []
         report: UpdateReport | None = None
         policy = self._policy()
         for index in range(first, first + schedule.episodes_per_iteration):
@@ -91,12 +100,15 @@ class InProcessRun:
             if schedule.updates_after(index):
                 report = self._trainer.update()
                 policy = self._policy()
+                updated_at.append((index + 1) * self._preset.task.horizon)
+                greedy_returns.append(self._return(env, Greedy(policy)))
         assert report is not None  # an update ends every iteration
         return CurvePoint(
             iteration=n_before + 1,
             samples=(n_before + 1) * schedule.episodes_per_iteration * self._preset.task.horizon,
             gradient_steps=self._trainer.gradient_steps,
-            greedy_return=self._return(env, Greedy(policy)),
+            updated_at=tuple(updated_at),
+            greedy_returns=tuple(greedy_returns),
             training_return=float(np.mean(returns)),
             loss=report.loss,
             mean_value=report.mean_value,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.service import make_task_env
+from actors.task import make_task_env
 from broker_config.codec import decode
 from broker_config.errors import PresetError
 from broker_config.journal import Journal
