@@ -7,7 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -22,6 +22,7 @@ from actors.task import make_task_env
 from broker_config.errors import StorageError
 from broker_config.messages import Ticket, TrajectoryId
 from broker_config.preset import Preset
+from broker_config.structure import from_plain, to_plain
 from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore
@@ -40,6 +41,10 @@ GUARDED_RETRIES = 3
 class Episode:
     """The result of one evaluation episode."""
 
+    version: int
+    mode: Mode
+    number: int
+    """Names the episode's seed."""
     return_: float
     success: bool
 
@@ -62,9 +67,10 @@ class Score:
 def evaluate(
     folder: RunFolder, versions: Sequence[int], episodes: int, mode: Mode, jobs: int
 ) -> list[Score]:
-    """Plays episodes with each version and writes `evaluation.json` into the run folder.
+    """Plays episodes with each version; each is a line of the folder's `evaluation.jsonl`.
 
-    All versions play the same seeds.
+    All versions play the same seeds. Episodes that are in the file already are not played again, so
+    that an interrupted evaluation goes on where it was.
 
     Args:
         folder: Of the run.
@@ -74,24 +80,48 @@ def evaluate(
         jobs: Processes.
 
     Raises:
-        StorageError: A version is not retained.
+        StorageError: A version is not retained, or the file holds something else.
     """
     preset = folder.read_preset()
     chosen = versions or _first_and_last(folder)
-    tasks = [(version, episode) for version in chosen for episode in range(episodes)]
-    with ProcessPoolExecutor(
-        jobs,
-        multiprocessing.get_context("spawn"),
-        _prepare,
-        (os.getpid(), folder.path, preset, mode),
-    ) as pool:
-        results = list(pool.map(_play, tasks))
-    scores = []
-    for number, version in enumerate(chosen):
-        part = results[number * episodes : (number + 1) * episodes]
-        scores.append(_score(version, mode, part, preset.seed))
-    folder.evaluation.write_text(json.dumps([asdict(score) for score in scores], indent=2) + "\n")
-    return scores
+    played = {(it.version, it.mode, it.number): it for it in _read(folder.evaluation)}
+    missing = [
+        (version, number)
+        for version in chosen
+        for number in range(episodes)
+        if (version, mode, number) not in played
+    ]
+    with (
+        folder.evaluation.open("a") as results,
+        ProcessPoolExecutor(
+            jobs,
+            multiprocessing.get_context("spawn"),
+            _prepare,
+            (os.getpid(), folder.path, preset, mode),
+        ) as pool,
+    ):
+        for episode in pool.map(_play, missing):
+            results.write(json.dumps(to_plain(episode)) + "\n")
+            results.flush()
+            played[episode.version, mode, episode.number] = episode
+    return [
+        _score([played[version, mode, number] for number in range(episodes)], preset.seed)
+        for version in chosen
+    ]
+
+
+def _read(path: Path) -> list[Episode]:
+    if not path.exists():
+        return []
+    whole, _, torn = path.read_text().rpartition("\n")
+    if torn:  # its process died while writing it
+        path.write_text(whole + "\n" if whole else "")
+    try:
+        return [from_plain(json.loads(line), Episode, path.name) for line in whole.splitlines()]
+    except ValueError as error:
+        raise StorageError(
+            f"{path}: expected evaluation episodes; got {error}; move the file away"
+        ) from error
 
 
 def bootstrap_interval(
@@ -113,12 +143,12 @@ def _first_and_last(folder: RunFolder) -> list[int]:
     return [versions[0], versions[-1]]
 
 
-def _score(version: int, mode: Mode, episodes: Sequence[Episode], seed: int) -> Score:
+def _score(episodes: Sequence[Episode], seed: int) -> Score:
     returns = tuple(episode.return_ for episode in episodes)
     successes = [float(episode.success) for episode in episodes]
     return Score(
-        version,
-        mode,
+        episodes[0].version,
+        episodes[0].mode,
         len(episodes),
         float(np.mean(returns)),
         bootstrap_interval(returns, seed),
@@ -170,7 +200,7 @@ class _Worker:
             trajectory = collect(self._env, policy, ticket, id_)
             if trajectory.guard is None:
                 break
-        return Episode(trajectory.return_, trajectory.success)
+        return Episode(version, self._mode, episode, trajectory.return_, trajectory.success)
 
     def _policy(self, version: int) -> ActingPolicy:
         if version not in self._policies:

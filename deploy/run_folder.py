@@ -66,8 +66,8 @@ class RunFolder:
 
     @property
     def evaluation(self) -> Path:
-        """What `clothbus evaluate` found."""
-        return self.path / "evaluation.json"
+        """Every episode that `clothbus evaluate` has played."""
+        return self.path / "evaluation.jsonl"
 
     def log(self, process: str) -> Path:
         """What a process wrote to its standard output and error."""

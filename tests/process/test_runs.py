@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from broker_config.journal import JOURNAL_FILE
+from deploy.status import read_status
 from tests.process.accounting import settle
 from tests.process.conftest import (
     Start,
@@ -100,11 +101,20 @@ def test_ctrl_c_ends_everything_and_the_run_can_be_resumed(start: Start, tmp_pat
 
 
 @pytest.mark.timeout(200)
-def test_processes_end_with_a_killed_supervisor(start: Start, tmp_path: Path, wait_until) -> None:
+def test_status_names_a_hung_process_and_all_end_with_a_killed_supervisor(
+    start: Start, tmp_path: Path, wait_until
+) -> None:
     run = start("run", *arguments(tmp_path / "run", "--actors", 1, "schedule.iterations=200"))
     folder = the_run(tmp_path / "run", run)
     wait_for_trajectories(folder, 1)
     pids = [heartbeat_pid(folder, name) for name in ("actor-0", "learner")]
+    address = (folder / "router.address").read_text().strip()
+    os.kill(pids[0], signal.SIGSTOP)
+    states = {it.id: it.heartbeat for it in read_status(address, folder.name)}
+    os.kill(pids[0], signal.SIGCONT)
+    assert states["actor-0"] is None
+    assert states["learner"] is not None
+    assert states["learner"].numbers["policy_version"] >= 1
     run.kill()
 
     def all_gone() -> bool:

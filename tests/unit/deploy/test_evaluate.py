@@ -33,13 +33,29 @@ def test_the_first_and_the_last_version_play_the_same_seeds(folder: RunFolder) -
     assert len(set(first.returns)) > 1
     low, high = first.return_interval
     assert low < first.mean_return < high
-    written = json.loads(folder.evaluation.read_text())
-    assert written[0]["mean_return"] == first.mean_return
+
+
+def test_an_evaluation_goes_on_where_it_was(folder: RunFolder) -> None:
+    evaluate(folder, (0,), 2, "greedy", jobs=1)
+    lines = folder.evaluation.read_text().splitlines()
+    first = json.loads(lines[0])
+    folder.evaluation.write_text(json.dumps({**first, "return_": 123.0}) + "\n")
+    with folder.evaluation.open("a") as file:
+        file.write('{"version": 0, "mo')  # killed while writing
+    (score,) = evaluate(folder, (0,), 2, "greedy", jobs=1)
+    assert score.returns == (123.0, json.loads(lines[1])["return_"])
+
+
+def test_a_file_of_something_else_is_refused(folder: RunFolder) -> None:
+    folder.evaluation.write_text("{}\n")
+    with pytest.raises(StorageError, match="expected evaluation episodes"):
+        evaluate(folder, (0,), 1, "greedy", jobs=1)
 
 
 def test_jobs_do_not_change_the_result(folder: RunFolder) -> None:
-    alone, together = (evaluate(folder, (0,), 4, "sampled", jobs) for jobs in (1, 2))
-    assert alone == together
+    alone = evaluate(folder, (0,), 4, "sampled", jobs=1)
+    folder.evaluation.unlink()
+    assert evaluate(folder, (0,), 4, "sampled", jobs=2) == alone
 
 
 def test_a_version_that_is_not_there_is_named_with_those_that_are(folder: RunFolder) -> None:

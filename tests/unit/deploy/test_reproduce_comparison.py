@@ -31,7 +31,9 @@ def without_time(points) -> list[CurvePoint]:
 
 def run_of(method, seed: int, returns: list[float]) -> FinishedRun:
     points = tuple(
-        CurvePoint(i + 1, 20 * (i + 1), 5, (20 * (i + 1),), (value,), value, 0.1, 0.2, 0.3, 0.4, 1.5)
+        CurvePoint(
+            i + 1, 20 * (i + 1), 5, (20 * (i + 1),), (value,), value, 0.1, 0.2, 0.3, 0.4, 1.5
+        )
         for i, value in enumerate(returns)
     )
     return FinishedRun(RunKey(method, seed, f"digest-{method}-{seed}"), "cpu", points)
