@@ -24,11 +24,6 @@ Each message reads *subject: expected rule; got value; what to do*.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from broker_config.messages import Refusal  # messages imports this module
-
 
 class ClothbusError(Exception):
     """Base of every error that clothbus raises on purpose; its text is meant for a person."""
@@ -75,17 +70,7 @@ class OwnerFailed(OwnerUnreachable):
 
 
 class Refused(BusError):
-    """The owner does not do what it was asked, and says why; asking again will not help.
-
-    Attributes:
-        refusal: The owner's words.
-    """
-
-    def __init__(self, refusal: Refusal) -> None:
-        super().__init__(
-            f"{refusal.subject}: expected {refusal.expected}; got {refusal.got}; {refusal.advice}"
-        )
-        self.refusal = refusal
+    """The owner does not do what it was asked, and says why; asking again will not help."""
 
 
 class AttachRefused(BusError):

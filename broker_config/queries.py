@@ -70,7 +70,9 @@ class PendingReply(Generic[Reply]):
     def _open(self, payload: bytes) -> Reply:
         answer = decode(payload, *self._expected, Refusal)
         if isinstance(answer, Refusal):
-            raise Refused(answer)
+            raise Refused(
+                f"{answer.subject}: expected {answer.expected}; got {answer.got}; {answer.advice}"
+            )
         return cast(Reply, answer)
 
     def _silence(self, timed_out: bool) -> str:

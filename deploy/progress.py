@@ -105,6 +105,7 @@ class Progress:
                     f"{self._numbers.get('transitions_per_sec', 0):.1f} transitions/s, "
                     f"loss {self._numbers.get('loss', float('nan')):.4g}, {minutes:.1f} min",
                     highlight=False,
+                    soft_wrap=True,
                 )
 
 

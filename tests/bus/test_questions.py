@@ -164,7 +164,7 @@ def test_a_handler_refuses_with_a_message_error_or_a_refusal(owner, ask_ticket):
     serve(owner, owner.keys.every(Kind.TICKET), TicketRequest, answer)
     with pytest.raises(Refused) as first:
         ask_ticket()
-    assert first.value.refusal == Refusal("seed", "3", "4", "send 3")
+    assert str(first.value) == "seed: expected 3; got 4; send 3"
     with pytest.raises(Refused, match="preset: expected digest a; got digest b; use the run's"):
         ask_ticket()
 
