@@ -23,7 +23,7 @@ from actors.rollout import (
 from actors.task import make_task_env
 from broker_config.bus import Bus
 from broker_config.codec import SCHEMA_VERSION
-from broker_config.errors import AttachRefused, OwnerUnreachable, Refused
+from broker_config.errors import AttachRefused, OwnerUnreachable, Refused, SpoolFull
 from broker_config.heart import Heart
 from broker_config.messages import (
     Attach,
@@ -61,7 +61,11 @@ class StopRequested(Exception):
 
 
 class Actor:
-    """One process that acts; `run` returns when the run has ended or the actor was drained."""
+    """One process that acts; `run` returns when the run has ended or the actor was drained.
+
+    Attributes:
+        state: What it is doing, in a word, as its heartbeats say.
+    """
 
     def __init__(
         self,
@@ -95,7 +99,7 @@ class Actor:
         self._incarnation = incarnation
         self._stop = threading.Event()
         self._owner_epoch = 0
-        self._state = "attaching"
+        self.state = "attaching"
         self._policy: tuple[int, ActingPolicy] | None = None
         self._version = -1
 
@@ -110,7 +114,10 @@ class Actor:
             AttachRefused: The owner's versions or preset differ.
             StorageError: The spool cannot be written.
         """
-        preset = self._attach()
+        try:
+            preset = self._attach()
+        except StopRequested:
+            return
         if recovered := self._spool.recover():
             _log.info("Recovered the %d finished steps of %s", recovered.steps, recovered.id)
         env = self._wrap_env(make_task_env(preset.task))
@@ -119,7 +126,7 @@ class Actor:
             "actor",
             self._name,
             self._incarnation,
-            lambda: (self._state, self._numbers()),
+            lambda: (self.state, self._numbers()),
         )
         key = self._keys.trajectory(self._name)
         try:
@@ -135,10 +142,11 @@ class Actor:
     def _act(self, env: ClothbusEnv, preset: Preset, delivery: Delivery) -> None:
         policies = self._bus.latest_reader(self._keys.policy, Snapshot)
         while True:
-            self._state = "waiting"
+            self.state = "waiting"
             reply = self._next_ticket()
             if reply.owner_epoch != self._owner_epoch:
                 self._attach()
+                self._policy = None
             if reply.instruction in (Instruction.STOP, Instruction.DRAIN):
                 delivery.flush(wait_until(time.monotonic() + FLUSH_AT_END_SECS))
                 _log.info("Leaving: %s", reply.instruction.value)
@@ -146,7 +154,7 @@ class Actor:
             if reply.ticket is not None:
                 version = reply.ticket.policy_version
                 policy = self._exact_policy(preset, version, policies.get())
-                self._state = "collecting"
+                self.state = "collecting"
                 self._play(env, policy, reply.ticket)
                 delivery.notify()
 
@@ -195,7 +203,7 @@ class Actor:
             try:
                 return ask()
             except OwnerUnreachable as error:
-                self._state = "waiting for the owner"
+                self.state = "waiting for the owner"
                 _log.debug("%s", error)
                 self._stop.wait(RETRY_SECS)
         raise StopRequested
@@ -207,7 +215,7 @@ class Actor:
         if self._policy is None or self._policy[0] != version:
             snapshot = newest
             if snapshot is None or snapshot.version != version:
-                self._state = "fetching the policy"
+                self.state = "fetching the policy"
                 request = SnapshotRequest(version)
                 key = self._keys.policy_version(version)
                 snapshot = self._insist(
@@ -220,20 +228,21 @@ class Actor:
 
     def _play(self, env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> None:
         id_ = self._spool.next_id()
-        start: Start | None = None
+        events = rollout(env, policy, ticket)
+        start = next(events)
+        assert isinstance(start, Start)
+        if self._spool_steps:
+            self._when_there_is_room(lambda: self._spool.begin(id_, ticket, start.observation))
         steps: list[Step] = []
-        for event in rollout(env, policy, ticket):
-            if self._stop.is_set():
+        for step in events:
+            assert isinstance(step, Step)
+            steps.append(step)
+            if self._spool_steps:
+                self._spool.append_step(step.action, step.reward, step.observation)
+            # Only now: what was done is recorded before anything else happens.
+            is_over = step.terminated or step.truncated or len(steps) == ticket.steps
+            if self._stop.is_set() and not is_over:
                 raise StopRequested
-            if isinstance(event, Start):
-                start = event
-                if self._spool_steps:
-                    self._spool.begin(id_, ticket, start.observation)
-            else:
-                steps.append(event)
-                if self._spool_steps:
-                    self._spool.append_step(event.action, event.reward, event.observation)
-        assert start is not None
         trajectory = to_trajectory(id_, ticket, start, steps)
         if self._spool_steps:
             self._spool.finish(
@@ -243,7 +252,19 @@ class Actor:
                 guard=trajectory.guard,
             )
         else:
-            self._spool.put(trajectory)
+            self._when_there_is_room(lambda: self._spool.put(trajectory))
+
+    def _when_there_is_room(self, add: Callable[[], None]) -> None:
+        """Adds to the spool; while it is full, waits for the owner to take something from it."""
+        while not self._stop.is_set():
+            try:
+                return add()
+            except SpoolFull as error:
+                if self.state != "spool full":
+                    _log.warning("Waiting: %s", error)
+                self.state = "spool full"
+                self._stop.wait(RETRY_SECS)
+        raise StopRequested
 
     def _numbers(self) -> Mapping[str, float]:
         return {"policy_version": self._version, "spooled": self._spool.status().trajectories}
