@@ -41,15 +41,23 @@ class Delivery:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._closing = True
-        self.notify()
+        with self._changed:
+            self._closing = True
+            self._generation += 1
+            self._changed.notify_all()
         self._thread.join()
 
     def notify(self) -> None:
-        """Says that the spool has something new."""
+        """Says that the spool has something new.
+
+        Raises:
+            ClothbusError: Delivery has failed for good: the owner refuses, or the spool is broken.
+        """
         with self._changed:
             self._generation += 1
             self._changed.notify_all()
+            if self._failure is not None:
+                raise self._failure
 
     def flush(self, keep_waiting: Callable[[], bool]) -> bool:
         """Waits until everything is acked; returns whether it is.
@@ -57,6 +65,9 @@ class Delivery:
         Args:
             keep_waiting: Asked several times a second; False gives up. Nothing is lost by that:
                 what is left is delivered at the next start.
+
+        Raises:
+            ClothbusError: Delivery has failed for good.
         """
         self.notify()
         with self._changed:

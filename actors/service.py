@@ -141,22 +141,34 @@ class Actor:
 
     def _act(self, env: ClothbusEnv, preset: Preset, delivery: Delivery) -> None:
         policies = self._bus.latest_reader(self._keys.policy, Snapshot)
+        unplayable: Ticket | None = None
         while True:
+            delivery.notify()
             self.state = "waiting"
-            reply = self._next_ticket()
+            reply = self._next_ticket(unplayable)
+            unplayable = None
             if reply.owner_epoch != self._owner_epoch:
                 self._attach()
                 self._policy = None
             if reply.instruction in (Instruction.STOP, Instruction.DRAIN):
-                delivery.flush(wait_until(time.monotonic() + FLUSH_AT_END_SECS))
-                _log.info("Leaving: %s", reply.instruction.value)
+                self._leave(delivery, reply.instruction)
                 return
             if reply.ticket is not None:
-                version = reply.ticket.policy_version
-                policy = self._exact_policy(preset, version, policies.get())
+                try:
+                    policy = self._exact_policy(preset, reply.ticket, policies.get())
+                except Refused as error:
+                    _log.warning("Ticket %d given back: %s", reply.ticket.index, error)
+                    unplayable = reply.ticket
+                    continue
                 self.state = "collecting"
                 self._play(env, policy, reply.ticket)
-                delivery.notify()
+
+    def _leave(self, delivery: Delivery, instruction: Instruction) -> None:
+        if delivery.flush(wait_until(time.monotonic() + FLUSH_AT_END_SECS)):
+            _log.info("Leaving: %s", instruction.value)
+        else:
+            waiting = self._spool.status().trajectories
+            _log.warning("Leaving with %d trajectories in the spool, for the next start", waiting)
 
     # Joining ----------------------------------------------------------------------------------
 
@@ -172,11 +184,8 @@ class Actor:
         key = self._keys.attach("actor", self._name)
         welcome = self._insist(lambda: self._ask_to_attach(key, request))
         self._owner_epoch = welcome.owner_epoch
-        preset = preset_from_json(welcome.preset_json)
-        if self._preset is not None and preset.digest != self._preset.digest:
-            raise AttachRefused(f"run {self._keys.run}: its preset changed; restart this actor")
-        self._preset = preset
-        return preset
+        self._preset = preset_from_json(welcome.preset_json)
+        return self._preset
 
     def _ask_to_attach(self, key: str, request: Attach) -> Welcome:
         give_up_secs = time.monotonic() + ATTACH_PATIENCE_SECS
@@ -188,10 +197,11 @@ class Actor:
                     raise AttachRefused(f"run {self._keys.run}: {error}") from error
                 self._stop.wait(RETRY_SECS)
 
-    def _next_ticket(self) -> TicketReply:
+    def _next_ticket(self, unplayable: Ticket | None) -> TicketReply:
         # One nonce for one question, however often it has to be asked: an answer that came too
         # late is then not a lost ticket.
-        request = TicketRequest(self._name, self._incarnation, secrets.token_hex(8))
+        gives_back = (unplayable.index, unplayable.attempt) if unplayable else None
+        request = TicketRequest(self._name, self._incarnation, secrets.token_hex(8), gives_back)
         key = self._keys.ticket(self._name)
         return self._insist(
             lambda: self._bus.ask(key, request, TicketReply, timeout_secs=TICKET_TIMEOUT_SECS)
@@ -210,8 +220,15 @@ class Actor:
 
     # Acting -----------------------------------------------------------------------------------
 
-    def _exact_policy(self, preset: Preset, version: int, newest: Snapshot | None) -> ActingPolicy:
-        """The policy of this version, and no other."""
+    def _exact_policy(
+        self, preset: Preset, ticket: Ticket, newest: Snapshot | None
+    ) -> ActingPolicy:
+        """The policy of the ticket's version, and no other.
+
+        Raises:
+            Refused: The owner no longer has it.
+        """
+        version = ticket.policy_version
         if self._policy is None or self._policy[0] != version:
             snapshot = newest
             if snapshot is None or snapshot.version != version:
@@ -238,21 +255,23 @@ class Actor:
             assert isinstance(step, Step)
             steps.append(step)
             if self._spool_steps:
-                self._spool.append_step(step.action, step.reward, step.observation)
+                self._spool.append_step(
+                    step.action,
+                    step.reward,
+                    step.observation,
+                    terminated=step.terminated,
+                    success=step.success,
+                    guard=step.guard,
+                )
             # Only now: what was done is recorded before anything else happens.
             is_over = step.terminated or step.truncated or len(steps) == ticket.steps
             if self._stop.is_set() and not is_over:
                 raise StopRequested
-        trajectory = to_trajectory(id_, ticket, start, steps)
         if self._spool_steps:
-            self._spool.finish(
-                terminated=trajectory.terminated,
-                truncated=trajectory.truncated,
-                success=trajectory.success,
-                guard=trajectory.guard,
-            )
-        else:
-            self._when_there_is_room(lambda: self._spool.put(trajectory))
+            self._spool.finish()
+            return
+        trajectory = to_trajectory(id_, ticket, start, steps)
+        self._when_there_is_room(lambda: self._spool.put(trajectory))
 
     def _when_there_is_room(self, add: Callable[[], None]) -> None:
         """Adds to the spool; while it is full, waits for the owner to take something from it."""

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable, Mapping
 
 from broker_config.bus import Bus
-from broker_config.errors import BusError
+from broker_config.errors import ClothbusError
 from broker_config.messages import Heartbeat, Role
 
 _log = logging.getLogger(__name__)
@@ -21,7 +21,10 @@ Vitals = Callable[[], tuple[str, Mapping[str, float]]]
 
 
 class Heart:
-    """Beats on a thread of its own for as long as the context lasts."""
+    """Beats on a thread of its own for as long as the context lasts.
+
+    It shows that the process runs, not that its main thread gets anywhere.
+    """
 
     def __init__(
         self, bus: Bus, role: Role, process_id: str, incarnation: str, vitals: Vitals
@@ -47,13 +50,13 @@ class Heart:
     def _run(self) -> None:
         host, pid = socket.gethostname(), os.getpid()
         while True:
-            state, numbers = self._vitals()
-            beat = Heartbeat(
-                self._role, self._id, self._incarnation, host, pid, state, dict(numbers)
-            )
             try:
+                state, numbers = self._vitals()
+                beat = Heartbeat(
+                    self._role, self._id, self._incarnation, host, pid, state, dict(numbers)
+                )
                 self._publisher.put(beat)
-            except BusError as error:
+            except ClothbusError as error:
                 _log.debug("Heartbeat not sent: %s", error)
             if self._stop.wait(HEARTBEAT_SECS):
                 return

@@ -44,7 +44,7 @@ _GROUP_ENTRIES, _GROUP_BYTES = 1000, 32 << 20
 """A commit takes no more than this, so that the first of a burst does not wait for the last."""
 _ITERATION_BYTES = 4 << 20
 _PENDING_BYTES = 128 << 20
-"""More than this is not queued; `append` then waits for the disk."""
+"""With more than this queued, `wait_for_room` waits for the disk."""
 
 
 @dataclass(frozen=True)
@@ -203,11 +203,22 @@ class Journal(JournalReader):
         self._writer = threading.Thread(target=self._write, name="journal-writer", daemon=True)
         self._writer.start()
 
-    def append(self, entries: Sequence[tuple[str, bytes]]) -> Future[tuple[Appended, ...]]:
-        """Adds entries, all of them or none.
+    def wait_for_room(self) -> None:
+        """Waits while much more is queued than the disk can take; call it before large appends.
 
-        Waits only while much more is queued than the disk can take. Names that are there already
-        are skipped. Appends of one thread get offsets in the order of the calls.
+        It is apart from `append` so that no lock need be held meanwhile: commits are told to
+        callbacks, which may want that lock.
+        """
+        with self._pending:
+            self._pending.wait_for(
+                lambda: self._is_closed or self._pending_bytes < _PENDING_BYTES,
+            )
+
+    def append(self, entries: Sequence[tuple[str, bytes]]) -> Future[tuple[Appended, ...]]:
+        """Adds entries, all of them or none; returns at once.
+
+        Names that are there already are skipped. Appends of one thread get offsets in the order of
+        the calls.
 
         Args:
             entries: Name and payload of each.
@@ -223,9 +234,6 @@ class Journal(JournalReader):
         _check_types(entries)
         request = _Append(tuple(entries), sum(len(payload) for _, payload in entries), Future())
         with self._pending:
-            self._pending.wait_for(
-                lambda: self._is_closed or self._pending_bytes < _PENDING_BYTES,
-            )
             self._require_open()
             self._pending_bytes += request.size
             self._requests.put(request)

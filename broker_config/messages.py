@@ -109,7 +109,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """A process lives and moves; without it, a live process is taken for hung."""
+    """A process runs and is on the bus; without it, a living one is stopped or cut off."""
 
     role: Role
     id: str
@@ -176,6 +176,8 @@ class TicketRequest:
     actor: str
     incarnation: str
     nonce: str
+    gives_back: tuple[int, int] | None = None
+    """Index and attempt of a ticket that the actor cannot play."""
 
     def __post_init__(self) -> None:
         require_id("ticket_request.actor", self.actor)

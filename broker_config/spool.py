@@ -32,7 +32,8 @@ _SCHEMA = Schema(
     application_id=0x636C6F73,  # "clos"
     version=1,
     statements=(
-        "CREATE TABLE spool (actor TEXT NOT NULL, next_sequence INTEGER NOT NULL)",
+        "CREATE TABLE spool (run TEXT NOT NULL, actor TEXT NOT NULL,"
+        " next_sequence INTEGER NOT NULL)",
         "CREATE TABLE outbox (sequence INTEGER PRIMARY KEY, incarnation TEXT NOT NULL,"
         " payload BLOB NOT NULL)",
         # At most one episode is open: the robot acts in one place at a time.
@@ -41,7 +42,8 @@ _SCHEMA = Schema(
         " height INTEGER NOT NULL, width INTEGER NOT NULL, channels INTEGER NOT NULL,"
         " first_observation BLOB NOT NULL, reserved_bytes INTEGER NOT NULL)",
         "CREATE TABLE steps (step INTEGER PRIMARY KEY, action INTEGER NOT NULL,"
-        " reward REAL NOT NULL, observation BLOB NOT NULL, unix_secs REAL NOT NULL)",
+        " reward REAL NOT NULL, observation BLOB NOT NULL, unix_secs REAL NOT NULL,"
+        " terminated INTEGER NOT NULL, success INTEGER NOT NULL, guard TEXT)",
     ),
 )
 _OVERHEAD_BYTES = 4096
@@ -77,21 +79,23 @@ class Spool:
     Sequence numbers go on across restarts and never repeat.
     """
 
-    def __init__(self, path: Path, actor: str, incarnation: str, max_bytes: int) -> None:
+    def __init__(self, path: Path, run: str, actor: str, incarnation: str, max_bytes: int) -> None:
         """Opens the spool, and makes it if it is missing.
 
         Args:
             path: The SQLite file.
+            run: For which run; its trajectories mean nothing to another.
             actor: Whose trajectories it holds.
             incarnation: Of the process that acts now; part of every new trajectory's id.
             max_bytes: How much may wait.
 
         Raises:
-            MessageError: Actor or incarnation are no ids.
+            MessageError: Run, actor or incarnation are no ids.
             AlreadyOwned: Another process has the spool open.
-            StorageError: The file cannot be used, or belongs to another actor.
+            StorageError: The file cannot be used, or belongs to another actor or run.
         """
         self._path = path
+        self._run = require_id("spool's run", run)
         self._actor = require_id("spool's actor", actor)
         self._incarnation = require_id("spool's incarnation", incarnation)
         self._max_bytes = max_bytes
@@ -106,13 +110,16 @@ class Spool:
 
     def _claim(self) -> None:
         with storage_errors(_SCHEMA.subject, self._path), transaction(self._connection):
-            row = self._connection.execute("SELECT actor FROM spool").fetchone()
+            row = self._connection.execute("SELECT run, actor FROM spool").fetchone()
             if row is None:
-                self._connection.execute("INSERT INTO spool VALUES (?, 0)", [self._actor])
-            elif row[0] != self._actor:
+                self._connection.execute(
+                    "INSERT INTO spool VALUES (?, ?, 0)", [self._run, self._actor]
+                )
+            elif row != (self._run, self._actor):
                 raise StorageError(
-                    f"spool {self._path}: expected the spool of {self._actor}; got that of "
-                    f"{row[0]}; give every actor a spool of its own"
+                    f"spool {self._path}: expected the spool of {self._actor} in run {self._run}; "
+                    f"got that of {row[1]} in run {row[0]}; give every actor a spool of its own "
+                    "for each run"
                 )
 
     def next_id(self) -> TrajectoryId:
@@ -175,13 +182,25 @@ class Spool:
                 ],
             )
 
-    def append_step(self, action: int, reward: float, observation: NDArray[np.uint8]) -> None:
-        """Writes a step of the open episode.
+    def append_step(
+        self,
+        action: int,
+        reward: float,
+        observation: NDArray[np.uint8],
+        *,
+        terminated: bool = False,
+        success: bool = False,
+        guard: str | None = None,
+    ) -> None:
+        """Writes a step of the open episode, with all that is known of it.
 
         Args:
             action: The index that was carried out.
             reward: What it earned.
             observation: u8[H, W, C] after it, of the first one's shape.
+            terminated: Whether it ended the task.
+            success: Whether the task counts as solved after it.
+            guard: Why the step must not be learned from.
 
         Raises:
             StorageError: No episode is open, or the disk is full or fails.
@@ -198,13 +217,20 @@ class Spool:
                     f"got {list(shape)}; a camera's settings have changed"
                 )
             self._connection.execute(
-                "INSERT INTO steps (action, reward, observation, unix_secs) VALUES (?, ?, ?, ?)",
-                [int(action), float(reward), observation.tobytes(), time.time()],
+                "INSERT INTO steps (action, reward, observation, unix_secs, terminated, success,"
+                " guard) VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [
+                    int(action),
+                    float(reward),
+                    observation.tobytes(),
+                    time.time(),
+                    terminated,
+                    success,
+                    guard,
+                ],
             )
 
-    def finish(
-        self, *, terminated: bool, truncated: bool, success: bool, guard: str | None
-    ) -> Trajectory | None:
+    def finish(self) -> Trajectory | None:
         """Closes the open episode and moves it to the trajectories that wait.
 
         Returns:
@@ -215,7 +241,7 @@ class Spool:
         """
         with self._changing():
             self._open_shape()
-            return self._close_episode(terminated, truncated, success, guard, interrupted=False)
+            return self._close_episode(interrupted=False)
 
     def recover(self) -> Trajectory | None:
         """Closes an episode that a crash left open; call it before the first `begin`.
@@ -230,9 +256,7 @@ class Spool:
         with self._changing():
             if self._connection.execute("SELECT 1 FROM episode").fetchone() is None:
                 return None
-            return self._close_episode(
-                terminated=False, truncated=True, success=False, guard=None, interrupted=True
-            )
+            return self._close_episode(interrupted=True)
 
     def pending(self) -> Iterator[Spooled]:
         """What waits, oldest first, one payload in memory at a time.
@@ -307,11 +331,10 @@ class Spool:
             [trajectory_id.sequence, trajectory_id.incarnation, payload],
         )
 
-    def _close_episode(
-        self, terminated: bool, truncated: bool, success: bool, guard: str | None, interrupted: bool
-    ) -> Trajectory | None:
+    def _close_episode(self, interrupted: bool) -> Trajectory | None:
         steps = self._connection.execute(
-            "SELECT action, reward, observation, unix_secs FROM steps ORDER BY step"
+            "SELECT action, reward, observation, unix_secs, terminated, success, guard"
+            " FROM steps ORDER BY step"
         ).fetchall()
         trajectory = None
         if steps:
@@ -326,10 +349,10 @@ class Spool:
                 observations=np.frombuffer(pictures, np.uint8).reshape(len(steps) + 1, *shape),
                 actions=np.array([step[0] for step in steps], np.int32),
                 rewards=np.array([step[1] for step in steps], np.float32),
-                terminated=terminated,
-                truncated=truncated,
-                success=success,
-                guard=guard,
+                terminated=bool(steps[-1][4]),
+                truncated=not steps[-1][4],
+                success=bool(steps[-1][5]),
+                guard=steps[-1][6],
                 interrupted=interrupted,
                 ended_unix_secs=steps[-1][3],
             )

@@ -10,11 +10,17 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from broker_config.errors import ClothbusError, PresetError
+from broker_config.errors import ClothbusError, PresetError, RouterUnreachable
 from broker_config.messages import Command
 from broker_config.preset import Preset
 from broker_config.session import DEFAULT_ADDRESS
-from deploy.process import CONFIGURATION_EXIT, end_with_supervisor, log_to_stderr
+from deploy.process import (
+    CONFIGURATION_EXIT,
+    INTERRUPTED_EXIT,
+    UNREACHABLE_EXIT,
+    end_with_supervisor,
+    log_to_stderr,
+)
 
 # What a command needs beyond this is imported when it runs: `clothbus status` shall not wait for
 # torch and a physics engine.
@@ -58,6 +64,7 @@ def run(
     from deploy.run import RunOptions, run_in_process, run_over_bus
     from deploy.run_folder import RunFolder, create_run_folder
 
+    _require_positive("actors", actors)
     if (preset is None) == (resume is None):
         raise PresetError("run: expected a PRESET or --resume FOLDER; give exactly one of them")
     if resume is not None:
@@ -69,7 +76,8 @@ def run(
         folder = create_run_folder(runs, chosen)
     options = RunOptions(actors, device, connect, demonstrations, step_log, zenoh)
     carry_out = run_in_process if in_process else run_over_bus
-    carry_out(folder, chosen, options, Console())
+    if not carry_out(folder, chosen, options, Console()):
+        sys.exit(INTERRUPTED_EXIT)
 
 
 def _refuse_unsupported(preset: Preset) -> None:
@@ -170,7 +178,7 @@ def actor(
         id: This actor's name; every actor has its own.
         connect: Address of the router.
         run: The run's name; not needed when the router carries one run.
-        spool: File in which trajectories wait for their ack; spools/ID.sqlite if not given.
+        spool: File in which trajectories wait for their ack; spools/RUN/ID.sqlite if not given.
         preset: What the run must be; without it, the actor takes what the run is.
         settings: Settings that replace the preset's.
         spool_steps: Make each step durable before the next, as a robot must.
@@ -183,7 +191,7 @@ def actor(
     run_actor(
         connect,
         id,
-        spool or Path("spools") / f"{id}.sqlite",
+        spool,
         run,
         load_preset(preset, settings) if preset else None,
         spool_steps,
@@ -242,7 +250,7 @@ def evaluate(
     /,
     episodes: int = 100,
     versions: tuple[int, ...] = (),
-    mode: Literal["sampled", "greedy"] = "sampled",
+    mode: Literal["sampled", "greedy"] | None = None,
     jobs: int = 1,
 ) -> None:
     """Score policy versions of a run on seeds of their own.
@@ -251,14 +259,19 @@ def evaluate(
         folder: The run folder.
         episodes: Episodes for each version.
         versions: Policy versions; the untrained and the newest if none is given.
-        mode: Sample actions from the policy, or take the preferred ones.
+        mode: Sample actions from the policy, or take the preferred ones; DQN has the latter only.
         jobs: Processes.
     """
     from deploy.evaluate import evaluate as evaluate_versions
     from deploy.evaluate import score_table
     from deploy.run_folder import RunFolder
 
-    scores = evaluate_versions(RunFolder(folder), versions, episodes, mode, jobs)
+    _require_positive("episodes", episodes)
+    _require_positive("jobs", jobs)
+    run_folder = RunFolder(folder)
+    is_dqn = run_folder.read_preset().algorithm.method == "dqn"
+    chosen = mode or ("greedy" if is_dqn else "sampled")
+    scores = evaluate_versions(run_folder, versions, episodes, chosen, jobs)
     Console().print(score_table(scores))
 
 
@@ -285,6 +298,7 @@ def collect(
     from deploy.collect import collect_demonstrations
     from deploy.presets import load_preset
 
+    _require_positive("episodes", episodes)
     console = Console()
     chosen = load_preset(preset, settings)
     _refuse_unsupported(chosen)
@@ -294,6 +308,11 @@ def collect(
             f"return {trajectory.return_:.2f}, {'success' if trajectory.success else 'no success'}",
             highlight=False,
         )
+
+
+def _require_positive(option: str, value: int) -> None:
+    if value < 1:
+        raise PresetError(f"--{option}: expected at least 1; got {value}")
 
 
 def _address(connect: str) -> str:
@@ -316,9 +335,10 @@ def main() -> None:
         app.cli(prog="clothbus", description="Teach robots to handle cloth, over a message bus.")
     except ClothbusError as error:
         print(f"clothbus: {error}", file=sys.stderr)  # noqa: T201 - for the person who typed it
-        sys.exit(CONFIGURATION_EXIT)
+        is_unreachable = isinstance(error, RouterUnreachable)
+        sys.exit(UNREACHABLE_EXIT if is_unreachable else CONFIGURATION_EXIT)
     except KeyboardInterrupt:
-        sys.exit(130)
+        sys.exit(INTERRUPTED_EXIT)
 
 
 if __name__ == "__main__":

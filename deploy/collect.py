@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
@@ -27,6 +28,9 @@ from learner.owner import Owner
 from learner.snapshots import SnapshotStore
 
 Demonstrator = Literal["scripted", "random"]
+
+MANY = 1_000_000
+"""Episodes; more than anybody demonstrates."""
 
 
 def collect_demonstrations(
@@ -50,12 +54,15 @@ def collect_demonstrations(
 
     Raises:
         PresetError: The task has no script.
-        StorageError: The folder holds something else.
+        StorageError: The folder holds something else, also those of another demonstrator.
     """
-    folder = prepare_run_folder(output, _collecting(preset, episodes))
-    env = make_task_env(preset.task)
-    policy = _policy(env, preset, demonstrator, random_rate)
-    with own_run(folder.path), Journal(folder.journal) as journal:
+    folder = prepare_run_folder(output, _collecting(preset, demonstrator, random_rate))
+    with (
+        own_run(folder.path),
+        Journal(folder.journal) as journal,
+        closing(make_task_env(preset.task)) as env,
+    ):
+        policy = _policy(env, preset, demonstrator, random_rate)
         owner = Owner(folder.run, folder.read_preset(), journal)
         owner.policy_ready(SnapshotTaken(0, demonstrator, 0))
         actor = InProcessActor(owner, env, SnapshotStore(folder.snapshots), policy)
@@ -63,15 +70,19 @@ def collect_demonstrations(
             while not owner.is_ready(index):
                 actor.play_until_ready(index)
             yield from owner.trajectories(index)
-    env.close()
 
 
-def _collecting(preset: Preset, episodes: int) -> Preset:
-    """The preset with a schedule in which every episode acts on version 0: nothing is learned."""
+def _collecting(preset: Preset, demonstrator: Demonstrator, random_rate: float) -> Preset:
+    """The preset with a schedule in which every episode acts on version 0: nothing is learned.
+
+    Its name tells the demonstrator, so that a folder never mixes two; the number of episodes is no
+    part of it, so that more can be collected later.
+    """
     schedule = dataclasses.replace(
-        preset.schedule, iterations=episodes, episodes_per_iteration=1, policy_lag=episodes
+        preset.schedule, iterations=MANY, episodes_per_iteration=1, policy_lag=MANY
     )
-    return dataclasses.replace(preset, name=f"{preset.name}-demonstrations", schedule=schedule)
+    name = f"{preset.name}-{demonstrator}-{random_rate:g}"
+    return dataclasses.replace(preset, name=name, schedule=schedule)
 
 
 def _policy(

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,7 +20,7 @@ from actors.envs import ClothbusEnv
 from actors.policy import Policy
 from actors.rollout import ActingPolicy, collect
 from actors.task import make_task_env
-from broker_config.errors import StorageError
+from broker_config.errors import PresetError, StorageError
 from broker_config.messages import Ticket, TrajectoryId
 from broker_config.preset import Preset
 from broker_config.structure import from_plain, to_plain
@@ -34,7 +35,7 @@ EVALUATION_STREAM = 2**31
 """Keeps the seeds of evaluation apart from those of every ticket of the run."""
 
 BOOTSTRAP_SAMPLES = 10_000
-GUARDED_RETRIES = 3
+GUARDED_ATTEMPTS = 20
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,14 @@ def evaluate(
         jobs: Processes.
 
     Raises:
+        PresetError: The mode has no meaning for the method.
         StorageError: A version is not retained, or the file holds something else.
     """
     preset = folder.read_preset()
+    if mode == "sampled" and preset.algorithm.method == "dqn":
+        raise PresetError(
+            f"{preset.name}: expected mode greedy; got sampled; Q has no softmax policy"
+        )
     chosen = versions or _first_and_last(folder)
     played = {(it.version, it.mode, it.number): it for it in _read(folder.evaluation)}
     missing = [
@@ -100,10 +106,16 @@ def evaluate(
             (os.getpid(), folder.path, preset, mode),
         ) as pool,
     ):
-        for episode in pool.map(_play, missing):
-            results.write(json.dumps(to_plain(episode)) + "\n")
-            results.flush()
-            played[episode.version, mode, episode.number] = episode
+        try:
+            for episode in pool.map(_play, missing):
+                results.write(json.dumps(to_plain(episode)) + "\n")
+                results.flush()
+                played[episode.version, mode, episode.number] = episode
+        except BrokenProcessPool as error:
+            raise StorageError(
+                "evaluation: expected workers that live; got one that died, its last words are "
+                "above; what was played is kept, evaluate again"
+            ) from error
     return [
         _score([played[version, mode, number] for number in range(episodes)], preset.seed)
         for version in chosen
@@ -193,14 +205,18 @@ class _Worker:
     def play(self, version: int, episode: int) -> Episode:
         """Plays an episode; one that the guard ends is played again on another seed."""
         policy = self._policy(version)
-        for attempt in range(GUARDED_RETRIES):
+        for attempt in range(GUARDED_ATTEMPTS):
             seed = derive_seed(self._preset.seed, EVALUATION_STREAM + episode, attempt, 0)
             ticket = Ticket(episode, attempt, 0, seed, version, self._preset.task.horizon, 0.0)
             id_ = TrajectoryId("evaluation", "evaluation", episode)
             trajectory = collect(self._env, policy, ticket, id_)
             if trajectory.guard is None:
-                break
-        return Episode(version, self._mode, episode, trajectory.return_, trajectory.success)
+                score = trajectory.return_, trajectory.success
+                return Episode(version, self._mode, episode, *score)
+        raise StorageError(
+            f"evaluation episode {episode}: expected a sound attempt with one of "
+            f"{GUARDED_ATTEMPTS} seeds; got {trajectory.guard}; mend the task or the simulator"
+        )
 
     def _policy(self, version: int) -> ActingPolicy:
         if version not in self._policies:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import threading
 import time
 
 from actors.acting import collecting_policy
@@ -17,7 +16,6 @@ from learner.owner import Owner
 from learner.snapshots import SnapshotStore
 
 ACTOR = "in-process"
-COMMIT_TIMEOUT_SECS = 60.0
 IDLE_SECS = 0.1
 
 
@@ -65,10 +63,7 @@ class InProcessActor:
         id_ = TrajectoryId(ACTOR, self._incarnation, self._sequence)
         self._sequence += 1
         trajectory = collect(self._env, self._policy_of(ticket.policy_version), ticket, id_)
-        committed = threading.Event()
-        self._owner.receive(trajectory, encode(trajectory), lambda _: committed.set())
-        if not committed.wait(COMMIT_TIMEOUT_SECS):
-            raise StorageError(f"journal: expected a commit; trajectory {id_} is not in it")
+        self._owner.receive(trajectory, encode(trajectory)).result()
 
     def _policy_of(self, version: int) -> ActingPolicy:
         if self._fixed_policy is not None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import signal
 import subprocess
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -19,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 SHORT_LIFE_SECS = 5.0
 SHORT_LIVES_BEFORE_GIVING_UP = 5
-STOP_SECS = 8.0
+STOP_SECS = 15.0
 """A process that was asked to end has this long; then it is killed, which loses nothing."""
 
 
@@ -104,7 +106,14 @@ class Supervisor:
         return False
 
     def stop(self) -> None:
-        """Ends what still lives: first those started last, the router after everyone else."""
+        """Ends what still lives: actors, then the learner, then the router.
+
+        A second Ctrl-C does not cut this short: what is left would outlive us.
+        """
+        with _signals_ignored():
+            self._stop_in_order()
+
+    def _stop_in_order(self) -> None:
         by_role: list[list[Supervised]] = [[], [], []]
         for supervised in self._processes.values():
             rank = {"actor": 0, "owner": 1}.get(supervised.spec.role, 2)
@@ -151,6 +160,20 @@ class Supervisor:
                 env=dict(child_environment()),
                 start_new_session=True,
             )
+
+
+@contextmanager
+def _signals_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    handlers = [signal.signal(number, signal.SIG_IGN) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
 
 
 def _open_log(path: Path) -> IO[bytes]:

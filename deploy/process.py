@@ -16,6 +16,12 @@ PARENT_VARIABLE = "CLOTHBUS_PARENT_PID"
 CONFIGURATION_EXIT = 3
 """Exit code of an error that a restart would only repeat."""
 
+UNREACHABLE_EXIT = 4
+"""Exit code when there is no router: it may come back."""
+
+INTERRUPTED_EXIT = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
 _PR_SET_PDEATHSIG = 1
 
 
@@ -55,10 +61,10 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-def log_to_stderr(verbose: bool = False) -> None:
-    """Logs with time and process name's level, one line each."""
+def log_to_stderr() -> None:
+    """Logs one line for each event, with its time, level and module."""
     logging.basicConfig(
-        level=logging.DEBUG if verbose else logging.INFO,
+        level=logging.INFO,
         format="%(asctime)s %(levelname)s %(name)s: %(message)s",
         stream=sys.stderr,
     )

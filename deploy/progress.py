@@ -29,7 +29,7 @@ class Progress:
         self._lock = threading.Lock()
         self._numbers: dict[str, float] = {}
         self._episodes: dict[int, tuple[float, float]] = {}
-        self._printed_iterations = 0
+        self._printed = 0
         self._began_secs = time.monotonic()
         self._live = Live(
             console=console, refresh_per_second=REFRESH_PER_SEC, transient=True, auto_refresh=False
@@ -79,6 +79,10 @@ class Progress:
         table.add_row("policy version", f"{numbers.get('policy_version', 0):.0f}")
         table.add_row("policy lag", f"{numbers.get('policy_lag', 0):.0f}")
         table.add_row("loss", f"{numbers['loss']:.4g}" if "loss" in numbers else "-")
+        if wrong := numbers.get("invalid", 0) + numbers.get("lost", 0):
+            table.add_row("attempts gone wrong", f"{wrong:.0f} (see the learner's log)")
+        if numbers.get("paused"):
+            table.add_row("state", "paused: clothbus control resume")
         restarted = [f"{p.spec.id} x{p.restarts}" for p in processes if p.restarts]
         if restarted:
             table.add_row("restarted", ", ".join(restarted))
@@ -92,21 +96,30 @@ class Progress:
         return [self._episodes[index] for index in indices if index in self._episodes]
 
     def _print_finished_iterations(self) -> None:
+        """Prints each iteration once, when it has been learned from."""
+        per_iteration = self._schedule.episodes_per_iteration
         with self._lock:
-            episode = int(self._numbers.get("episode", 0))
-            while episode >= (self._printed_iterations + 1) * self._schedule.episodes_per_iteration:
-                recent = self._recent_episodes(self._printed_iterations)
-                self._printed_iterations += 1
-                minutes = (time.monotonic() - self._began_secs) / 60
-                self._console.print(
-                    f"iteration {self._printed_iterations} of {self._schedule.iterations}: "
-                    f"return {_mean_and_last([value for value, _ in recent])}, "
-                    f"success {_percentage([value for _, value in recent])}, "
-                    f"{self._numbers.get('transitions_per_sec', 0):.1f} transitions/s, "
-                    f"loss {self._numbers.get('loss', float('nan')):.4g}, {minutes:.1f} min",
-                    highlight=False,
-                    soft_wrap=True,
-                )
+            numbers = dict(self._numbers)
+            while numbers.get("learned_episodes", 0) >= (self._printed + 1) * per_iteration:
+                recent = self._recent_episodes(self._printed)
+                self._printed += 1
+                if recent:  # not of an earlier part of a resumed run
+                    self._print_iteration(recent, numbers)
+
+    def _print_iteration(
+        self, recent: Sequence[tuple[float, float]], numbers: Mapping[str, float]
+    ) -> None:
+        minutes = (time.monotonic() - self._began_secs) / 60
+        self._console.print(
+            f"iteration {self._printed} of {self._schedule.iterations}: "
+            f"return {_mean_and_last([value for value, _ in recent])}, "
+            f"success {_percentage([value for _, value in recent])}, "
+            f"{numbers.get('transitions_per_sec', 0):.1f} transitions/s, "
+            f"lag {numbers.get('policy_lag', 0):.0f}, "
+            f"loss {numbers.get('loss', float('nan')):.4g}, {minutes:.1f} min",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _mean_and_last(returns: Sequence[float]) -> str:

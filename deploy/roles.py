@@ -100,7 +100,7 @@ def run_learner(
 def run_actor(
     address: str,
     actor: str,
-    spool_path: Path,
+    spool_path: Path | None = None,
     run: str | None = None,
     preset: Preset | None = None,
     spool_steps: bool = False,
@@ -112,7 +112,7 @@ def run_actor(
     Args:
         address: The router's.
         actor: This actor's name.
-        spool_path: The file in which its trajectories wait.
+        spool_path: The file in which its trajectories wait; `spools/<run>/<actor>.sqlite` if None.
         run: The run, or None if the router carries only one.
         preset: What the run must be, or None to take what it is.
         spool_steps: Make each step durable before the next, as a robot must.
@@ -131,8 +131,9 @@ def run_actor(
     use_one_torch_thread()
     incarnation = secrets.token_hex(8)
     run = run or only_run(address, overrides)
+    path = spool_path or Path("spools") / run / f"{actor}.sqlite"
     with (
-        Spool(spool_path, actor, incarnation, SPOOL_MAX_BYTES) as spool,
+        Spool(path, run, actor, incarnation, SPOOL_MAX_BYTES) as spool,
         open_bus(address, run, "actor", actor, overrides) as bus,
     ):
         process = Actor(

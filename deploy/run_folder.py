@@ -60,6 +60,11 @@ class RunFolder:
         return self.path / "film_strip.png"
 
     @property
+    def router_address(self) -> Path:
+        """Where the embedded router of the run listens."""
+        return self.path / "router.address"
+
+    @property
     def summary(self) -> Path:
         """The one-screen summary that `run` prints at its end."""
         return self.path / "summary.txt"
@@ -85,7 +90,7 @@ class RunFolder:
         """
         try:
             return preset_from_json(self.preset_file.read_text())
-        except FileNotFoundError as error:
+        except OSError as error:
             raise StorageError(
                 f"{self.path}: expected a run folder with preset.json; got none; "
                 "name a folder that `clothbus run` made"
@@ -101,6 +106,8 @@ def create_run_folder(runs: Path, preset: Preset) -> RunFolder:
             path.mkdir(parents=True)
         except FileExistsError:
             continue
+        except OSError as error:
+            raise _unusable(path, error) from error
         return prepare_run_folder(path, preset)
     raise StorageError(f"{runs}: expected room for a new run at {stamp}; choose another --runs")
 
@@ -112,15 +119,25 @@ def prepare_run_folder(path: Path, preset: Preset) -> RunFolder:
         StorageError: It is a folder of another preset's run.
     """
     folder = RunFolder(path)
-    (path / "logs").mkdir(parents=True, exist_ok=True)
-    (path / "spools").mkdir(exist_ok=True)
     if not folder.preset_file.exists():
-        partial = folder.preset_file.with_suffix(".partial")
-        partial.write_text(preset.to_json())
-        partial.replace(folder.preset_file)
+        try:
+            (path / "logs").mkdir(parents=True, exist_ok=True)
+            (path / "spools").mkdir(exist_ok=True)
+            partial = folder.preset_file.with_suffix(".partial")
+            partial.write_text(preset.to_json())
+            partial.replace(folder.preset_file)
+        except OSError as error:
+            raise _unusable(path, error) from error
     elif (existing := folder.read_preset()).digest != preset.digest:
         raise StorageError(
             f"{path}: expected a run of preset {preset.name} ({preset.digest[:12]}); got one of "
             f"{existing.name} ({existing.digest[:12]}); resume it without a preset of your own"
         )
     return folder
+
+
+def _unusable(path: Path, error: OSError) -> StorageError:
+    return StorageError(
+        f"run folder {path}: expected a place that can be written; got {error}; "
+        "choose another with --runs"
+    )

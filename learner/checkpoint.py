@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,12 +21,12 @@ import safetensors.torch
 from torch import Tensor
 
 from broker_config.errors import StorageError
+from learner.durable import PARTIAL_SUFFIX, write_durably
 from learner.trainer import TrainerState
 
 _log = logging.getLogger(__name__)
 
 _NAME = re.compile(r"checkpoint-(\d{8,})\.safetensors")
-_PARTIAL_SUFFIX = ".partial"
 _HEADER_KEY = "clothbus_checkpoint"
 _FORMAT = 1
 
@@ -71,7 +70,7 @@ class CheckpointStore:
         numbers = self._numbers()
         path = self._path(numbers[-1] + 1 if numbers else 0)
         try:
-            _write_durably(path, data)
+            write_durably(path, data)
             self._remove_old()
         except OSError as error:
             raise StorageError(
@@ -109,23 +108,8 @@ class CheckpointStore:
     def _remove_old(self) -> None:
         for number in self._numbers()[: -self._keep]:
             self._path(number).unlink(missing_ok=True)
-        for partial in self._folder.glob(f"*{_PARTIAL_SUFFIX}"):
+        for partial in self._folder.glob(f"*{PARTIAL_SUFFIX}"):
             partial.unlink(missing_ok=True)  # of a process that died while writing
-
-
-def _write_durably(path: Path, data: bytes) -> None:
-    partial = path.with_name(path.name + _PARTIAL_SUFFIX)
-    with partial.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-    # The rename itself is durable once the folder is synced.
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _serialise(state: TrainerState, extra: Mapping[str, Any]) -> bytes:

@@ -39,6 +39,8 @@ class PolicyReady:
     """A policy version exists, is stored and journaled."""
 
     snapshot: Snapshot
+    absorbed: int
+    """Tickets that were in the memory when it was trained."""
     report: UpdateReport | None
     """None when it was restored or is the untrained policy."""
 
@@ -130,16 +132,16 @@ class LearningLoop:
                     "demonstrations by; add it to the preset, or leave the demonstrations out"
                 )
             return
-        if self._demonstrations:
-            self._owner.keep_demonstrations(self._demonstrations)
-        kept = self._owner.demonstrations()
+        kept = self._demonstrations or self._owner.demonstrations()
         available = sum(item.steps for item in kept)
         if available < wanted.demonstration_samples:
             raise PresetError(
                 f"{self._owner.preset.name}: expected {wanted.demonstration_samples} demonstration "
-                f"samples; got {available}; record more with `clothbus collect` and name the file "
-                "with --demonstrations"
+                f"samples; got {available}; record more with `clothbus collect` and name the "
+                "folder with --demonstrations"
             )
+        if self._demonstrations:
+            self._owner.keep_demonstrations(self._demonstrations)
         left = wanted.demonstration_samples
         for item in kept:
             steps = min(left, item.steps)
@@ -147,7 +149,7 @@ class LearningLoop:
             left -= steps
             if left == 0:
                 break
-        self._report = self._trainer.update(wanted.target_switches)
+        self._report = self._trainer.initialise()
 
     # One step ---------------------------------------------------------------------------------
 
@@ -197,7 +199,7 @@ class LearningLoop:
         self._owner.policy_ready(SnapshotTaken(self._version, snapshot.digest, self._absorbed))
         self._snapshots.retain(self._schedule.policy_lag + 2, self._pinned_versions())
         report, self._report = self._report, None
-        return PolicyReady(snapshot, report)
+        return PolicyReady(snapshot, self._absorbed, report)
 
     def _pinned_versions(self) -> frozenset[int]:
         """The untrained policy and one version for each iteration are kept for evaluation."""

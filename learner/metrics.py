@@ -15,31 +15,27 @@ class LearningMetrics:
 
     Attributes:
         numbers: The newest value of each.
+        step: Episodes absorbed: the count against which everything is plotted.
     """
 
     def __init__(self, folder: Path) -> None:
         """Opens TensorBoard's log folder; a resumed run adds a file to it."""
         self.numbers: dict[str, float] = {}
+        self.step = 0
         self._writer = SummaryWriter(str(folder))
         self._began_secs = time.monotonic()
         self._transitions = 0
 
-    @property
-    def step(self) -> int:
-        """Episodes absorbed: the count against which everything is plotted."""
-        return int(self.numbers.get("episode", 0))
-
-    def note(self, event: PolicyReady | EpisodeAbsorbed) -> dict[str, float]:
-        """Takes in an event; returns a copy of all numbers."""
+    def note(self, event: PolicyReady | EpisodeAbsorbed) -> None:
+        """Takes in an event."""
         match event:
             case EpisodeAbsorbed():
-                new = self._of_episode(event)
+                new, self.step = self._of_episode(event), event.index + 1
             case PolicyReady():
-                new = _of_policy(event)
+                new, self.step = _of_policy(event), event.absorbed
         self.numbers.update(new)
         for name, number in new.items():
             self._writer.add_scalar(name, number, self.step)
-        return dict(self.numbers)
 
     def _of_episode(self, episode: EpisodeAbsorbed) -> dict[str, float]:
         self._transitions += episode.steps
@@ -62,7 +58,10 @@ class LearningMetrics:
 
 
 def _of_policy(policy: PolicyReady) -> dict[str, float]:
-    numbers: dict[str, float] = {"policy_version": policy.snapshot.version}
+    numbers: dict[str, float] = {
+        "policy_version": policy.snapshot.version,
+        "learned_episodes": policy.absorbed,
+    }
     if (report := policy.report) is not None:
         numbers |= {
             "loss": report.loss,

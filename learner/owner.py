@@ -21,11 +21,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
 
 from broker_config.codec import SCHEMA_VERSION, decode, decode_any, encode
-from broker_config.errors import StorageError
+from broker_config.errors import ClothbusError, StorageError
 from broker_config.journal import Appended, Journal
 from broker_config.messages import (
     Ack,
@@ -39,12 +40,14 @@ from broker_config.messages import (
     Refusal,
     RunStarted,
     SnapshotTaken,
+    Ticket,
     TicketIssued,
     TicketReply,
     TicketRequest,
     TicketReseeded,
     Trajectory,
     TrajectoryId,
+    Verdict,
     Welcome,
 )
 from broker_config.preset import Preset
@@ -54,12 +57,16 @@ from learner.tickets import TicketBook, TicketEvent
 
 _log = logging.getLogger(__name__)
 
+MOST_GENERATIONS = 20
+"""A ticket whose seed was replaced this often will not be solved by one more."""
+
 
 class Owner:
     """Issues tickets, takes trajectories and keeps the journal of one run.
 
     Thread-safe: the bus's threads and the learning thread share it. `changed` is notified, and
-    `changes` grows, whenever a waiting ticket request or the learning loop may go on.
+    `changes` grows, whenever a waiting ticket request or the learning loop may go on; `attempts`
+    counts those of this epoch that went wrong.
     """
 
     def __init__(self, run: str, preset: Preset, journal: Journal) -> None:
@@ -80,7 +87,8 @@ class Owner:
         self._stopping = False
         self._draining: set[str] = set()
         self._controls = 0
-        self._failure: StorageError | None = None
+        self._failure: ClothbusError | None = None
+        self.attempts: Counter[Verdict] = Counter()
         self.epoch = self._replay() + 1
         started = RunStarted(run, self.epoch, preset.to_json(), VERSION)
         self._append((f"run/{self.epoch}", started)).result()
@@ -119,29 +127,38 @@ class Owner:
         """Answers a ticket request, or None while there is nothing to collect.
 
         The answer may be sent once the future has resolved: then it is in the journal.
+
+        Raises:
+            StorageError: The run cannot go on.
         """
         with self.changed:
-            instruction = self._instruction(request.actor)
-            ticket, events = None, list[TicketEvent]()
-            if instruction is Instruction.COLLECT:
-                ticket, events = self._book.issue(request, self._latest_version, now_secs)
-                if ticket is None and not events:
-                    return None
-                if ticket is None:
-                    instruction = Instruction.WAIT
-            reply = TicketReply(instruction, request.nonce, self.epoch, ticket)
-            return reply, self._append(*map(_named, events))
+            self._require_sound()
+            if (farewell := self._farewell(request.actor)) is not None:
+                return self._reply(request, farewell), _nothing_to_commit()
+            if (repeated := self._book.repeated(request)) is not None:
+                self._book.heard(request.actor, request.incarnation, now_secs)
+                return self._reply(request, Instruction.COLLECT, repeated), _nothing_to_commit()
+            if self._paused:
+                return None
+            ticket, events = self._book.issue(request, self._latest_version, now_secs)
+            future = self._append_events(events)
+            if ticket is None:
+                return None
+            return self._reply(request, Instruction.COLLECT, ticket), future
 
-    def _instruction(self, actor: str) -> Instruction:
+    def _farewell(self, actor: str) -> Instruction | None:
         if self._book.all_complete or self._stopping:
             return Instruction.STOP
-        if actor in self._draining:
-            return Instruction.DRAIN
-        return Instruction.WAIT if self._paused else Instruction.COLLECT
+        return Instruction.DRAIN if actor in self._draining else None
+
+    def _reply(
+        self, request: TicketRequest, instruction: Instruction, ticket: Ticket | None = None
+    ) -> TicketReply:
+        return TicketReply(instruction, request.nonce, self.epoch, ticket)
 
     def wait_reply(self, request: TicketRequest) -> TicketReply:
         """What a request gets when its long poll ends without a ticket."""
-        return TicketReply(Instruction.WAIT, request.nonce, self.epoch)
+        return self._reply(request, Instruction.WAIT)
 
     def heard(self, actor: str, incarnation: str, now_secs: float) -> None:
         """Renews an actor's leases."""
@@ -151,42 +168,47 @@ class Owner:
     def expire_leases(self, now_secs: float) -> None:
         """Gives up what silent actors were collecting, so that others collect it again."""
         with self.changed:
+            self._require_sound()
             if events := self._book.expire(now_secs):
-                self._append(*map(_named, events))
+                self._append_events(events)
                 self.note_change()
 
     # Trajectories -----------------------------------------------------------------------------
 
-    def receive(
-        self, trajectory: Trajectory, payload: bytes, committed: Callable[[Ack], None]
-    ) -> None:
-        """Takes a trajectory; `committed` is called from another thread once it is durable.
+    def receive(self, trajectory: Trajectory, payload: bytes) -> Future[Ack]:
+        """Takes a trajectory; the ack is there once it is durable.
 
         A resend is recognised by its id and acknowledged again, and changes nothing. If the journal
-        fails, `committed` is not called and the sender keeps what it has.
+        fails, so does the future, and the sender keeps what it has.
 
         Raises:
             MessageError: The preset's network cannot learn from it.
+            StorageError: The run cannot go on.
         """
         trajectory.check_fits(self.preset.network)
+        self._journal.wait_for_room()
         with self.changed:
+            self._require_sound()
             known = self._book.verdict(trajectory.id)
             events = [] if known else self._book.close(trajectory)
             verdict = known or self._book.verdict(trajectory.id)
             assert verdict is not None
-            future = self._append((trajectory_name(trajectory.id), payload), *map(_named, events))
+            appended = self._append_events(events, (trajectory_name(trajectory.id), payload))
+        ack: Future[Ack] = Future()
 
         def acknowledge(done: Future[tuple[Appended, ...]]) -> None:
-            if done.exception() is not None:
+            if (error := done.exception()) is not None:
+                ack.set_exception(error)
                 return
             stored = done.result()[0]
             with self.changed:
                 self._stored.add(trajectory.id)
                 self.note_change()
             is_duplicate = not stored.is_new
-            committed(Ack(trajectory.id, self.epoch, stored.offset, verdict, is_duplicate))
+            ack.set_result(Ack(trajectory.id, self.epoch, stored.offset, verdict, is_duplicate))
 
-        future.add_done_callback(acknowledge)
+        appended.add_done_callback(acknowledge)
+        return ack
 
     # What the learning loop asks --------------------------------------------------------------
 
@@ -200,6 +222,11 @@ class Owner:
         """Whether every episode of the run is in the journal."""
         with self.changed:
             return self._book.all_complete
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether tickets are held back until a `resume`."""
+        return self._paused
 
     @property
     def is_stopping(self) -> bool:
@@ -223,8 +250,7 @@ class Owner:
             self.changed.wait_for(
                 lambda: self.is_ready(index) or self._stopping or self._failure, timeout_secs
             )
-            if self._failure is not None:
-                raise self._failure
+            self._require_sound()
             return self.is_ready(index)
 
     def trajectories(self, index: int) -> list[Trajectory]:
@@ -243,10 +269,22 @@ class Owner:
         return [decode(entry.payload, Trajectory) for entry in entries]
 
     def keep_demonstrations(self, demonstrations: Sequence[Trajectory]) -> None:
-        """Makes the demonstrations part of the run's record."""
-        self._append(
-            *((f"demonstration/{n:06d}", item) for n, item in enumerate(demonstrations))
-        ).result()
+        """Makes the demonstrations part of the run's record.
+
+        Raises:
+            MessageError: The preset's network cannot learn from one of them.
+            StorageError: The run has others already.
+        """
+        for item in demonstrations:
+            item.check_fits(self.preset.network)
+        kept = [item.id for item in self.demonstrations()]
+        if kept and kept != [item.id for item in demonstrations]:
+            raise StorageError(
+                f"demonstrations: expected the {len(kept)} that run {self.run} began with; got "
+                "others; leave --demonstrations out, or begin a new run"
+            )
+        named = [(f"demonstration/{n:06d}", item) for n, item in enumerate(demonstrations)]
+        self._append(*named).result()
 
     def policy_ready(self, snapshot: SnapshotTaken) -> None:
         """Journals a policy version; from then on tickets may name it."""
@@ -269,6 +307,7 @@ class Owner:
             actors: Who is there, for a `drain` that names nobody.
         """
         with self.changed:
+            self._require_sound()
             self._controls += 1
             future = self._append((f"control/{self.epoch}/{self._controls}", control))
             self._apply_control(control, actors)
@@ -297,23 +336,50 @@ class Owner:
 
     # The journal ------------------------------------------------------------------------------
 
+    def _append_events(
+        self, events: Sequence[TicketEvent], *first: tuple[str, object]
+    ) -> Future[tuple[Appended, ...]]:
+        for event in events:
+            self._note_trouble(event)
+        return self._append(*first, *map(_named, events))
+
     def _append(self, *entries: tuple[str, object]) -> Future[tuple[Appended, ...]]:
+        if not entries:
+            return _nothing_to_commit()
         future = self._journal.append(
             [(name, item if isinstance(item, bytes) else encode(item)) for name, item in entries]
         )
-        future.add_done_callback(self._note_failure)
+        future.add_done_callback(self._note_append_failure)
         return future
 
-    def _note_failure(self, done: Future[tuple[Appended, ...]]) -> None:
-        error = done.exception()
-        if error is None:
-            return
+    def _note_append_failure(self, done: Future[tuple[Appended, ...]]) -> None:
+        if (error := done.exception()) is not None:
+            self.fail(error)
+
+    def _note_trouble(self, event: TicketEvent) -> None:
+        """Says what went wrong; a ticket that no seed solves ends the run."""
+        if isinstance(event, AttemptEnded) and event.reason:
+            self.attempts[event.verdict] += 1
+            _log.warning("Ticket %d: %s, %s", event.ticket, event.verdict.value, event.reason)
+        if isinstance(event, TicketReseeded) and event.generation >= MOST_GENERATIONS:
+            self.fail(
+                StorageError(
+                    f"ticket {event.ticket}: expected a sound attempt with one of "
+                    f"{MOST_GENERATIONS} seeds; got none; see the learner's log for the reasons, "
+                    "and mend the task or the simulator"
+                )
+            )
+
+    def fail(self, error: BaseException) -> None:
+        """Ends the run with an error, from any thread: nothing more is issued or acked."""
         _log.error("The run cannot go on: %s", error)
         with self.changed:
-            self._failure = (
-                error if isinstance(error, StorageError) else StorageError(f"journal: {error}")
-            )
+            self._failure = error if isinstance(error, ClothbusError) else StorageError(str(error))
             self.note_change()
+
+    def _require_sound(self) -> None:
+        if self._failure is not None:
+            raise self._failure
 
     def _replay(self) -> int:
         """Rebuilds the book; returns the last epoch."""
@@ -349,3 +415,9 @@ def _named(event: TicketEvent) -> tuple[str, TicketEvent]:
             return f"ended/{event.trajectory}", event
         case TicketReseeded():
             return f"reseeded/{event.ticket}/{event.generation}", event
+
+
+def _nothing_to_commit() -> Future[tuple[Appended, ...]]:
+    future: Future[tuple[Appended, ...]] = Future()
+    future.set_result(())
+    return future

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
+from concurrent.futures import Future
 from contextlib import ExitStack
 
 from broker_config.bus import Bus, Publisher
 from broker_config.codec import encode
+from broker_config.errors import AlreadyOwned, BusError
 from broker_config.heart import Heart
 from broker_config.journal import Journal
 from broker_config.keys import Kind, ParsedKey
 from broker_config.messages import (
+    Ack,
     Attach,
     Control,
     Heartbeat,
@@ -20,10 +22,12 @@ from broker_config.messages import (
     JournalRequest,
     Metrics,
     Refusal,
+    Role,
     Snapshot,
     SnapshotRequest,
     TicketRequest,
     Trajectory,
+    Verdict,
     weights_digest,
 )
 from broker_config.queries import Responder
@@ -38,6 +42,13 @@ _log = logging.getLogger(__name__)
 FAREWELL_SECS = 10.0
 """How long a finished learner stays to tell its actors that the run is over."""
 
+SILENCE_SECS = 1.5
+"""Three heartbeats: a process that was not heard of for so long has left its name."""
+
+TOKEN_SECS = 3.0
+"""A killed process's token is gone by then."""
+
+POLL_SECS = 0.1
 MAX_BATCH_BYTES = 32 << 20
 
 
@@ -63,11 +74,12 @@ class LearnerService:
         self._metrics = metrics
         self._keys = bus.keys
         self._state = "starting"
-        self._actors: dict[str, str] = {}
-        self._actors_changed = threading.Condition()
+        self._heard: dict[str, tuple[str, float]] = {}
+        """Incarnation of each actor, and when it was last heard of."""
 
     def run(self) -> None:
         """Learns until the end of the run; everything on the bus closes with it."""
+        self._refuse_second_owner()
         with ExitStack() as stack:
             desk = stack.enter_context(TicketDesk(self._owner))
             self._serve(desk)
@@ -78,7 +90,7 @@ class LearnerService:
                     "owner",
                     self._name,
                     incarnation,
-                    lambda: (self._state, dict(self._metrics.numbers)),
+                    lambda: (self._state, self._numbers()),
                 )
             )
             policies = self._bus.latest_publisher(self._keys.policy)
@@ -94,23 +106,46 @@ class LearnerService:
                 policies.put(event.snapshot)
             else:
                 self._state = "learning"
-            numbers = self._metrics.note(event)
-            metrics.put(Metrics("owner", self._name, self._metrics.step, numbers))
+            self._metrics.note(event)
+            metrics.put(Metrics("owner", self._name, self._metrics.step, self._numbers()))
+
+    def _numbers(self) -> dict[str, float]:
+        attempts = self._owner.attempts
+        wrong = {"invalid": attempts[Verdict.INVALID], "lost": attempts[Verdict.LOST]}
+        state = {"paused": float(self._owner.is_paused)}
+        return self._metrics.numbers | wrong | state
 
     def _wait_for_farewells(self) -> None:
         """Stays until every actor has heard that it may leave."""
         deadline_secs = time.monotonic() + FAREWELL_SECS
-        while time.monotonic() < deadline_secs and any(
-            key.role == "actor" for key in self._bus.alive()
-        ):
-            with self._actors_changed:
-                self._actors_changed.wait(0.1)
+        try:
+            while time.monotonic() < deadline_secs and self._alive("actor"):
+                time.sleep(POLL_SECS)
+        except BusError as error:
+            _log.warning("Leaving without a farewell: %s", error)
+
+    def _refuse_second_owner(self) -> None:
+        """Two owners of one run name would each get a part of what actors send.
+
+        Raises:
+            AlreadyOwned: Another process owns a run of this name on this router.
+        """
+        deadline_secs = time.monotonic() + TOKEN_SECS
+        while self._alive("owner"):
+            if time.monotonic() > deadline_secs:
+                raise AlreadyOwned(
+                    f"run {self._bus.keys.run}: expected no other owner on the router; got one; "
+                    "stop it, or give one of the run folders another name"
+                )
+            time.sleep(POLL_SECS)
+
+    def _alive(self, role: Role) -> bool:
+        return any(key.role == role for key in self._bus.alive())
 
     # What others ask --------------------------------------------------------------------------
 
     def _serve(self, desk: TicketDesk) -> None:
         keys, bus = self._keys, self._bus
-        bus.watch_alive(self._on_alive)
         bus.subscribe(keys.every(Kind.LIVE), Heartbeat, self._on_heartbeat)
         bus.serve(keys.every(Kind.ATTACH), Attach, self._on_attach)
         bus.serve(keys.every(Kind.TRAJECTORY), Trajectory, self._on_trajectory)
@@ -124,22 +159,16 @@ class LearnerService:
             lambda _, request, to: desk.ask(request, to.reply),
         )
 
-    def _on_alive(self, key: ParsedKey, is_alive: bool) -> None:
-        with self._actors_changed:
-            if key.role == "actor" and not is_alive:
-                self._actors.pop(str(key.id), None)
-            self._actors_changed.notify_all()
-
     def _on_heartbeat(self, _: ParsedKey, heartbeat: Heartbeat) -> None:
         if heartbeat.role == "actor":
-            with self._actors_changed:
-                self._actors[heartbeat.id] = heartbeat.incarnation
-            self._owner.heard(heartbeat.id, heartbeat.incarnation, time.monotonic())
+            now_secs = time.monotonic()
+            self._heard[heartbeat.id] = heartbeat.incarnation, now_secs
+            self._owner.heard(heartbeat.id, heartbeat.incarnation, now_secs)
 
     def _on_attach(self, _: ParsedKey, request: Attach, to: Responder) -> None:
-        with self._actors_changed:
-            living = self._actors.get(request.id, request.incarnation)
-        if request.role == "actor" and living != request.incarnation:
+        living, heard_secs = self._heard.get(request.id, (request.incarnation, 0.0))
+        is_fresh = time.monotonic() - heard_secs < SILENCE_SECS
+        if request.role == "actor" and living != request.incarnation and is_fresh:
             to.reply(
                 Refusal(
                     "actor name",
@@ -152,11 +181,18 @@ class LearnerService:
         to.reply(self._owner.attach(request))
 
     def _on_trajectory(self, _: ParsedKey, trajectory: Trajectory, to: Responder) -> None:
-        self._owner.receive(trajectory, encode(trajectory), to.reply)
+        def answer(ack: Future[Ack]) -> None:
+            error = ack.exception()
+            if isinstance(error, Exception):
+                to.fail(error)
+            else:
+                to.reply(ack.result())
+
+        self._owner.receive(trajectory, encode(trajectory)).add_done_callback(answer)
 
     def _on_snapshot_request(self, _: ParsedKey, request: SnapshotRequest, to: Responder) -> None:
         weights = self._snapshots.get(request.version)
-        if weights is None or request.version > self._owner.latest_version:
+        if weights is None:
             retained = ", ".join(map(str, self._snapshots.versions()))
             to.reply(
                 Refusal(
@@ -176,6 +212,4 @@ class LearnerService:
         to.reply(JournalBatch(self._owner.epoch, entries, self._journal.end_offset))
 
     def _on_control(self, _: ParsedKey, control: Control, to: Responder) -> None:
-        with self._actors_changed:
-            actors = list(self._actors)
-        to.reply(self._owner.control(control, actors))
+        to.reply(self._owner.control(control, list(self._heard)))

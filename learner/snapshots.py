@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
 from broker_config.errors import StorageError
+from learner.durable import write_durably
 
 _NAME = re.compile(r"(\d{6,})\.safetensors")
 
@@ -15,7 +15,17 @@ class SnapshotStore:
     """A folder of safetensors files, one for each retained policy version."""
 
     def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        """Opens the folder, and makes it if it is missing.
+
+        Raises:
+            StorageError: It cannot be made.
+        """
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(
+                f"snapshots {folder}: expected a folder; got {error}; choose another run folder"
+            ) from error
         self._folder = folder
 
     def put(self, version: int, weights: bytes) -> None:
@@ -25,15 +35,13 @@ class SnapshotStore:
             StorageError: The disk refuses.
         """
         path = self._path(version)
-        partial = path.with_suffix(".partial")
         try:
-            with partial.open("wb") as file:
-                file.write(weights)
-                file.flush()
-                os.fsync(file.fileno())
-            partial.replace(path)
+            write_durably(path, weights)
         except OSError as error:
-            raise StorageError(f"snapshot {path}: {error}; free disk space and resume") from error
+            raise StorageError(
+                f"snapshot {path}: expected to write {len(weights)} bytes; got {error}; free disk "
+                "space and resume"
+            ) from error
 
     def get(self, version: int) -> bytes | None:
         """The weights of a version, or None if it is not retained."""

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from broker_config.errors import StorageError
 from broker_config.messages import TicketReply, TicketRequest
 from learner.owner import Owner
 
@@ -28,11 +27,14 @@ class _Held:
 
 
 class TicketDesk:
-    """Answers ticket requests in the order of their arrival, on a thread of its own."""
+    """Answers ticket requests in the order of their arrival, on a thread of its own.
+
+    A request is either held or being decided, never both, so that it is answered exactly once.
+    """
 
     def __init__(self, owner: Owner) -> None:
         self._owner = owner
-        self._held: list[_Held] = []
+        self._held: dict[str, _Held] = {}
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="ticket-desk", daemon=True)
 
@@ -48,40 +50,52 @@ class TicketDesk:
     def ask(self, request: TicketRequest, answer: Callable[[TicketReply], None]) -> None:
         """Holds a request; `answer` is called once, from the desk's thread or this one."""
         held = _Held(request, answer, time.monotonic() + POLL_SECS)
+        self._hold(held, replaces=True)
+        self._owner.note_change()
+
+    def _hold(self, held: _Held, replaces: bool) -> None:
+        """An actor has one question at a time: the newer one stays, the other is told to wait."""
+        actor = held.request.actor
         with self._owner.changed:
-            # An actor has one question at a time: a newer one replaces what it no longer awaits.
-            given_up = [other for other in self._held if other.request.actor == request.actor]
-            self._held = [other for other in self._held if other not in given_up] + [held]
-            self._owner.note_change()
-        for other in given_up:
+            other = self._held.get(actor)
+            if other is None or replaces:
+                self._held[actor] = held
+            else:
+                other = held
+        if other is not None:
             other.answer(self._owner.wait_reply(other.request))
 
     def _run(self) -> None:
-        while not self._closing:
-            seen = self._owner.changes
-            self._owner.expire_leases(time.monotonic())
-            with self._owner.changed:
-                round_ = list(self._held)
-            answered = [held for held in round_ if self._try_answer(held)]
-            with self._owner.changed:
-                self._held = [held for held in self._held if held not in answered]
-                self._owner.changed.wait_for(
-                    lambda seen=seen: self._owner.changes != seen,  # type: ignore[misc]
-                    LEASE_CHECK_SECS,
-                )
-        for held in self._held:
+        try:
+            while not self._closing:
+                seen = self._owner.changes
+                self._owner.expire_leases(time.monotonic())
+                self._decide_all()
+                with self._owner.changed:
+                    self._owner.changed.wait_for(
+                        lambda seen=seen: self._owner.changes != seen,  # type: ignore[misc]
+                        LEASE_CHECK_SECS,
+                    )
+        except Exception as error:
+            _log.exception("The ticket desk stopped")
+            self._owner.fail(error)
+        while self._held:
+            _, held = self._held.popitem()
             held.answer(self._owner.wait_reply(held.request))
+
+    def _decide_all(self) -> None:
+        for actor in list(self._held):
+            with self._owner.changed:
+                held = self._held.pop(actor, None)
+            if held is not None and not self._try_answer(held):
+                self._hold(held, replaces=False)
 
     def _try_answer(self, held: _Held) -> bool:
         now_secs = time.monotonic()
         issued = self._owner.issue(held.request, now_secs)
         if issued is not None:
             reply, committed = issued
-            try:
-                committed.result()
-            except StorageError as error:
-                _log.error("Ticket for %s not issued: %s", held.request.actor, error)
-                return True  # unanswered: the actor asks the next owner again
+            committed.result()
             held.answer(reply)
             return True
         if now_secs >= held.deadline_secs:

@@ -50,7 +50,7 @@ class _TicketState:
     steps: int = 0
     complete: bool = False
     parts: list[TrajectoryId] = field(default_factory=list)
-    issued: dict[int, Ticket] = field(default_factory=dict)
+    issued: dict[int, TicketIssued] = field(default_factory=dict)
     """By attempt."""
 
 
@@ -78,11 +78,6 @@ class TicketBook:
         """Whether every episode of the run has been collected."""
         return self._first_incomplete == self._schedule.episodes
 
-    @property
-    def outstanding(self) -> int:
-        """Attempts that are being collected now."""
-        return len(self._outstanding)
-
     def is_complete(self, index: int) -> bool:
         """Whether ticket `index` has all its steps."""
         return index < len(self._tickets) and self._tickets[index].complete
@@ -103,7 +98,7 @@ class TicketBook:
         """Finds a ticket for an actor.
 
         Args:
-            request: Who asks. The nonce of an answered request gets the same ticket again.
+            request: Who asks.
             latest_version: Newest policy version that exists.
             now_secs: Monotonic clock.
 
@@ -111,9 +106,7 @@ class TicketBook:
             The ticket, or None if nothing may be collected now; and the events.
         """
         self.heard(request.actor, request.incarnation, now_secs)
-        if (repeated := self._repeated(request)) is not None:
-            return repeated, []
-        events = self._end_earlier_incarnations(request)
+        events = self._end_earlier_incarnations(request) + self._take_back(request)
         index = self._next_index(latest_version)
         if index is None:
             return None, events
@@ -121,6 +114,14 @@ class TicketBook:
             self._make_ticket(index), request.actor, request.incarnation, request.nonce
         )
         return issued.ticket, [*events, self._applied(issued)]
+
+    def repeated(self, request: TicketRequest) -> Ticket | None:
+        """The ticket that a request of this nonce has been given before, if it still counts."""
+        last = self._last_request.get(request.actor)
+        if last is None or last.nonce != request.nonce:
+            return None
+        is_outstanding = (last.ticket.index, last.ticket.attempt) in self._outstanding
+        return last.ticket if is_outstanding else None
 
     def close(self, trajectory: Trajectory) -> list[TicketEvent]:
         """Judges a trajectory that arrived for the first time."""
@@ -177,7 +178,7 @@ class TicketBook:
             self._tickets.append(_TicketState())
         state = self._tickets[ticket.index]
         state.attempts = ticket.attempt + 1
-        state.issued[ticket.attempt] = ticket
+        state.issued[ticket.attempt] = event
         self._outstanding[ticket.index, ticket.attempt] = event
         self._last_request[event.actor] = event
 
@@ -200,13 +201,6 @@ class TicketBook:
             case Verdict.LOST:
                 state.lost += 1
 
-    def _repeated(self, request: TicketRequest) -> Ticket | None:
-        last = self._last_request.get(request.actor)
-        if last is None or last.nonce != request.nonce:
-            return None
-        is_outstanding = (last.ticket.index, last.ticket.attempt) in self._outstanding
-        return last.ticket if is_outstanding else None
-
     def _end_earlier_incarnations(self, request: TicketRequest) -> list[TicketEvent]:
         """A restarted actor has delivered its spool before it asks: what is left is lost."""
         events: list[TicketEvent] = []
@@ -214,6 +208,12 @@ class TicketBook:
             if issued.actor == request.actor and issued.incarnation != request.incarnation:
                 events += self._lose(issued, f"{issued.actor} restarted")
         return events
+
+    def _take_back(self, request: TicketRequest) -> list[TicketEvent]:
+        issued = self._outstanding.get(request.gives_back) if request.gives_back else None
+        if issued is None or issued.actor != request.actor:
+            return []
+        return self._lose(issued, f"{issued.actor} cannot play it")
 
     def _lose(self, issued: TicketIssued, reason: str) -> list[TicketEvent]:
         ticket = issued.ticket
@@ -257,7 +257,9 @@ class TicketBook:
     def _judge(self, trajectory: Trajectory) -> tuple[Verdict, str]:
         ticket, steps = trajectory.ticket, trajectory.steps
         state = self._tickets[ticket.index] if ticket.index < len(self._tickets) else _TicketState()
-        if state.issued.get(ticket.attempt) != ticket:
+        issued, id_ = state.issued.get(ticket.attempt), trajectory.id
+        is_holder = issued and (issued.actor, issued.incarnation) == (id_.actor, id_.incarnation)
+        if issued is None or issued.ticket != ticket or not is_holder:
             return Verdict.UNASKED, f"ticket {ticket.index} was not issued like this"
         if trajectory.guard is not None:
             return Verdict.INVALID, f"guard: {trajectory.guard}"

@@ -91,7 +91,7 @@ class FakeOwner:
 
 @pytest.fixture
 def make_actor(attach: Any, tmp_path: Path) -> Iterator[Callable[..., Actor]]:
-    with Spool(tmp_path / "spool.sqlite", "actor-1", "life", 1 << 20) as spool:
+    with Spool(tmp_path / "spool.sqlite", "run", "actor-1", "life", 1 << 20) as spool:
         bus = attach("actor", "actor-1")
         yield lambda **options: Actor(bus, "actor-1", spool, "life", **options)
 
@@ -117,7 +117,8 @@ def test_a_full_spool_makes_a_simulator_wait_and_nothing_is_lost(
     owner = FakeOwner(attach("owner", "learner"), [0, 0, 0])
     owner.acks.clear()
     one_episode = 11 * 84 * 84 + 5000
-    with Spool(tmp_path / "small.sqlite", "actor-1", "life", int(1.5 * one_episode)) as spool:
+    limit = int(1.5 * one_episode)
+    with Spool(tmp_path / "small.sqlite", "run", "actor-1", "life", limit) as spool:
         actor = Actor(attach("actor", "actor-1"), "actor-1", spool, "life")
         thread = threading.Thread(target=actor.run)
         thread.start()

@@ -85,7 +85,7 @@ def test_without_a_router_or_a_run_the_command_says_what_to_do(
     start: Start, tmp_path: Path, free_port: int
 ) -> None:
     nobody = start("nobody", "status", "--connect", f"tcp/127.0.0.1:{free_port}")
-    assert nobody.wait(30) == 3
+    assert nobody.wait(30) == 4
     assert f"clothbus router --listen tcp/127.0.0.1:{free_port}" in nobody.log.read_text()
     router = start("router", "router", "--address-file", tmp_path / "address")
     address = wait_for_file(tmp_path / "address", router)

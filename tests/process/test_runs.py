@@ -85,7 +85,7 @@ def test_ctrl_c_ends_everything_and_the_run_can_be_resumed(start: Start, tmp_pat
     wait_for_trajectories(folder, 3)
     pids = [heartbeat_pid(folder, name) for name in ("actor-0", "actor-1", "learner")]
     run.process.send_signal(signal.SIGINT)
-    assert run.wait(60) == 0, run.log.read_text()[-3000:]
+    assert run.wait(60) == 130, run.log.read_text()[-3000:]
     for pid in pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
@@ -96,7 +96,7 @@ def test_ctrl_c_ends_everything_and_the_run_can_be_resumed(start: Start, tmp_pat
     resumed = start("resumed", "run", "--resume", folder, "--in-process")
     wait_for_trajectories(folder, 8)
     resumed.process.send_signal(signal.SIGINT)
-    assert resumed.wait(60) == 0, resumed.log.read_text()[-3000:]
+    assert resumed.wait(60) == 130, resumed.log.read_text()[-3000:]
     assert before >= 1
 
 

@@ -29,8 +29,8 @@ def path(tmp_path):
 
 @pytest.fixture
 def open_spool(path):
-    def open_(incarnation="inc-1", max_bytes=16 * MIB, actor="actor-01"):
-        return Spool(path, actor, incarnation, max_bytes)
+    def open_(incarnation="inc-1", max_bytes=16 * MIB, actor="actor-01", run="run"):
+        return Spool(path, run, actor, incarnation, max_bytes)
 
     return open_
 
@@ -94,7 +94,7 @@ def test_room_for_all_steps_is_reserved_before_the_robot_moves(open_spool, make_
         for step in range(TICKET.steps):
             spool.append_step(step, 0.0, picture(step))
         assert spool.status().open_steps == 10
-        spool.finish(terminated=False, truncated=True, success=False, guard="x" * 500)
+        spool.finish()
         assert spool.status().used_bytes <= 12 * picture(0).nbytes
 
 
@@ -103,8 +103,8 @@ def test_an_episode_written_step_by_step_becomes_a_trajectory(open_spool):
         first = spool.next_id()
         spool.begin(first, TICKET, picture(10))
         spool.append_step(3, 0.5, picture(11))
-        spool.append_step(4, -0.5, picture(12))
-        done = spool.finish(terminated=True, truncated=False, success=True, guard=None)
+        spool.append_step(4, -0.5, picture(12), terminated=True, success=True)
+        done = spool.finish()
         (item,) = spool.pending()
         sent = decode(item.payload, Trajectory)
         for trajectory in (done, sent):
@@ -118,9 +118,25 @@ def test_an_episode_written_step_by_step_becomes_a_trajectory(open_spool):
             assert flags == (True, False, True)
             assert not trajectory.interrupted
         spool.begin(spool.next_id(), TICKET, picture(0))
-        assert spool.finish(terminated=False, truncated=True, success=False, guard="fell") is None
+        assert spool.finish() is None
         assert spool.status().trajectories == 1
         assert spool.recover() is None
+
+
+def test_a_guarded_step_stays_guarded_when_the_actor_dies_right_after_it(open_spool):
+    with open_spool() as spool:
+        spool.begin(spool.next_id(), TICKET, picture(0))
+        spool.append_step(0, 0.0, picture(1), guard="overstretched")
+    with open_spool("inc-2") as spool:
+        recovered = spool.recover()
+    assert (recovered.guard, recovered.interrupted) == ("overstretched", True)
+
+
+def test_a_spool_belongs_to_one_run(open_spool):
+    with open_spool():
+        pass
+    with pytest.raises(StorageError, match="expected the spool of actor-01 in run other"):
+        open_spool(run="other")
 
 
 KILLED_ACTOR = """
@@ -129,7 +145,7 @@ from pathlib import Path
 import numpy as np
 from broker_config.messages import Ticket
 from broker_config.spool import Spool
-spool = Spool(Path(sys.argv[1]), "actor-01", "inc-1", 64 << 20)
+spool = Spool(Path(sys.argv[1]), "run", "actor-01", "inc-1", 64 << 20)
 spool.begin(spool.next_id(), Ticket(4, 1, 0, 7, 2, 1000, 0.0), np.zeros((84, 84, 3), np.uint8))
 for step in range(int(sys.argv[2])):
     spool.append_step(step, float(step), np.full((84, 84, 3), step + 1, np.uint8))
@@ -183,7 +199,7 @@ def test_steps_that_no_trajectory_can_hold_are_refused_and_leave_the_episode_usa
         with pytest.raises(StorageError, match="call begin first"):
             spool.append_step(0, 0.0, picture(0))
         with pytest.raises(StorageError, match="call begin first"):
-            spool.finish(terminated=True, truncated=False, success=False, guard=None)
+            spool.finish()
         spool.begin(spool.next_id(), TICKET, picture(0))
         for step, text in (
             ((0, 0.0, np.zeros((42, 42, 3), np.uint8)), "a camera's settings have changed"),
@@ -194,7 +210,7 @@ def test_steps_that_no_trajectory_can_hold_are_refused_and_leave_the_episode_usa
             with pytest.raises(MessageError, match=text):
                 spool.append_step(*step)
         spool.append_step(0, 0.0, picture(1))
-        assert spool.finish(terminated=True, truncated=False, success=True, guard=None).steps == 1
+        assert spool.finish().steps == 1
 
 
 def test_ids_of_other_actors_and_incarnations_are_refused(open_spool, make_trajectory):
@@ -213,7 +229,7 @@ def test_an_episode_too_long_for_the_bus_is_refused_before_it_begins(open_spool)
 def test_a_spool_belongs_to_one_actor_and_one_process(path, open_spool):
     with open_spool(), pytest.raises(AlreadyOwned, match=f"spool .* got pid {os.getpid()}"):
         open_spool("inc-2")
-    with pytest.raises(StorageError, match="expected the spool of actor-02; got that of actor-01"):
+    with pytest.raises(StorageError, match="expected the spool of actor-02 in run run; got"):
         open_spool(actor="actor-02")
     with sqlite3.connect(path) as connection:
         connection.execute("PRAGMA user_version=9")

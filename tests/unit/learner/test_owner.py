@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import pytest
 
 from broker_config.codec import SCHEMA_VERSION, decode, encode
 from broker_config.errors import MessageError, StorageError
-from broker_config.journal import Journal
+from broker_config.journal import Appended, Journal
 from broker_config.messages import (
     Ack,
     Attach,
@@ -31,7 +31,7 @@ from broker_config.messages import (
 from broker_config.preset import Preset
 from broker_config.version import VERSION
 from deploy.presets import load_preset
-from learner.owner import Owner
+from learner.owner import MOST_GENERATIONS, Owner
 from learner.recorded import accepted_trajectories
 
 PRESET = load_preset("reaching-smoke", ["task.horizon=3"])
@@ -78,16 +78,7 @@ def play(reply: TicketReply | None, sequence: int = 0) -> Trajectory:
 
 
 def deliver(owner: Owner, trajectory: Trajectory) -> Ack:
-    acks: list[Ack] = []
-    arrived = threading.Event()
-
-    def committed(ack: Ack) -> None:
-        acks.append(ack)
-        arrived.set()
-
-    owner.receive(trajectory, encode(trajectory), committed)
-    assert arrived.wait(10)
-    return acks[0]
+    return owner.receive(trajectory, encode(trajectory)).result(10)
 
 
 def test_an_acked_trajectory_is_in_the_journal(journal: Journal) -> None:
@@ -133,10 +124,10 @@ def test_what_the_network_cannot_learn_from_is_refused_and_not_kept(journal: Jou
     sent = play(ask(owner))
     wrong = dataclasses.replace(sent, observations=np.zeros((4, 84, 84, 3), np.uint8))
     with pytest.raises(MessageError, match=r"uint8 \[T\+1, 84, 84, 1\].*\[4, 84, 84, 3\] from a"):
-        owner.receive(wrong, encode(wrong), lambda _: None)
+        owner.receive(wrong, encode(wrong))
     beyond = dataclasses.replace(sent, actions=np.full(3, 10, np.int32))
     with pytest.raises(MessageError, match="below 10; got 10 from a"):
-        owner.receive(beyond, encode(beyond), lambda _: None)
+        owner.receive(beyond, encode(beyond))
     assert journal.entries(prefix="trajectory/") == []
 
 
@@ -146,12 +137,61 @@ def test_a_journal_of_another_preset_is_refused(journal: Journal) -> None:
         own(journal, dataclasses.replace(PRESET, seed=7))
 
 
-def test_a_failing_journal_stops_the_run_and_acks_nothing(journal: Journal) -> None:
+class FailingJournal(Journal):
+    """A journal whose disk fills up when told."""
+
+    is_full = False
+
+    def append(self, entries: Sequence[tuple[str, bytes]]) -> Future[tuple[Appended, ...]]:
+        if not self.is_full:
+            return super().append(entries)
+        failed: Future[tuple[Appended, ...]] = Future()
+        failed.set_exception(StorageError("journal: disk is full"))
+        return failed
+
+
+def test_after_one_failed_append_nothing_more_is_issued_or_acked(tmp_path: Path) -> None:
+    with FailingJournal(tmp_path / "journal.sqlite") as journal:
+        owner = own(journal)
+        sent = play(ask(owner))
+        journal.is_full = True
+        with pytest.raises(StorageError, match="disk is full"):
+            deliver(owner, sent)
+        journal.is_full = False  # too late: book and journal no longer agree
+        for attempt in (
+            lambda: deliver(owner, sent),
+            lambda: ask(owner),
+            lambda: owner.wait_ready(0, 0.0),
+            lambda: owner.control(Control(Command.PAUSE)),
+            lambda: owner.expire_leases(1e6),
+        ):
+            with pytest.raises(StorageError, match="disk is full"):
+                attempt()
+        again = own(journal)
+        assert deliver(again, sent).verdict is Verdict.ACCEPTED
+        assert again.is_ready(0)
+
+
+def test_many_large_trajectories_at_once_do_not_stop_owner_and_journal(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("broker_config.journal._PENDING_BYTES", 50_000)
     owner = own(journal)
     sent = play(ask(owner))
-    journal.close()
-    with pytest.raises(StorageError):
-        owner.receive(sent, encode(sent), lambda _: pytest.fail("acked"))
+    others = [dataclasses.replace(sent, id=TrajectoryId("a", "life", n)) for n in range(40)]
+    acks = [owner.receive(other, encode(other)) for other in others]
+    verdicts = [ack.result(20).verdict for ack in acks]
+    assert verdicts == [Verdict.ACCEPTED, *[Verdict.SPARE] * 39]
+
+
+def test_a_ticket_that_no_seed_solves_ends_the_run(journal: Journal) -> None:
+    owner = own(journal)
+    for sequence in range(MOST_GENERATIONS):
+        broken = dataclasses.replace(play(ask(owner, nonce=f"n{sequence}"), sequence), guard="nan")
+        deliver(owner, broken)
+    with pytest.raises(StorageError, match="ticket 0: expected a sound attempt"):
+        owner.wait_ready(0, 0.0)
+    assert owner.attempts[Verdict.INVALID] == MOST_GENERATIONS
 
 
 @pytest.mark.parametrize(
@@ -183,18 +223,19 @@ def test_pause_resume_drain_and_stop_reach_actors_through_tickets(journal: Journ
         return reply.instruction if reply else None
 
     assert owner.control(Control(Command.PAUSE)).state == "paused"
-    assert instruction() is Instruction.WAIT
+    assert instruction() is None  # held, so that nobody asks in a tight loop
     assert owner.control(Control(Command.RESUME)).state == "running"
     assert instruction() is Instruction.COLLECT
+    owner.control(Control(Command.PAUSE))
+    assert instruction() is Instruction.COLLECT  # a lost answer is given again, paused or not
     owner.control(Control(Command.DRAIN, "b"))
     assert instruction("b") is Instruction.DRAIN
-    assert instruction() is Instruction.COLLECT
     assert owner.control(Control(Command.STOP)).state == "stopping"
     assert instruction() is Instruction.STOP
 
 
 def test_a_pause_outlives_the_owner(journal: Journal) -> None:
     own(journal).control(Control(Command.PAUSE))
-    reply = ask(own(journal))
-    assert reply is not None
-    assert reply.instruction is Instruction.WAIT
+    again = own(journal)
+    assert again.is_paused
+    assert ask(again) is None

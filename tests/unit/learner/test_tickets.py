@@ -39,11 +39,16 @@ def ask(actor: str, incarnation: str = "first", nonce: str | None = None) -> Tic
 
 
 def trajectory(
-    ticket: Ticket, actor: str = "a", steps: int | None = None, sequence: int = 0, **changes: object
+    ticket: Ticket,
+    actor: str = "a",
+    steps: int | None = None,
+    sequence: int = 0,
+    incarnation: str = "first",
+    **changes: object,
 ) -> Trajectory:
     steps = ticket.steps if steps is None else steps
     whole = Trajectory(
-        id=TrajectoryId(actor, "first", sequence),
+        id=TrajectoryId(actor, incarnation, sequence),
         ticket=ticket,
         observations=np.zeros((steps + 1, 84, 84, 1), np.uint8),
         actions=np.zeros(steps, np.int32),
@@ -75,7 +80,22 @@ def test_actors_get_different_tickets_and_a_repeated_nonce_the_same(preset: Pres
     request = ask("a", nonce="once")
     first = issue(book, request)
     assert issue(book, ask("b")).index == first.index + 1
-    assert issue(book, request) == first
+    assert book.repeated(request) == first
+    assert book.repeated(ask("a", nonce="another")) is None
+
+
+def test_a_ticket_that_is_given_back_goes_to_the_next_who_asks(preset: Preset) -> None:
+    book = TicketBook(preset)
+    first = issue(book, ask("a"))
+    request = dataclasses.replace(ask("a"), gives_back=(first.index, first.attempt))
+    again, events = book.issue(request, 99, now_secs=0.0)
+    assert verdict_of(events) is Verdict.LOST
+    assert again is not None
+    assert (again.index, again.attempt) == (first.index, first.attempt + 1)
+    stolen = dataclasses.replace(ask("b"), gives_back=(again.index, again.attempt))
+    other, _ = book.issue(stolen, 99, now_secs=0.0)
+    assert other is not None
+    assert other.index == first.index + 1
 
 
 def test_a_ticket_waits_for_exactly_its_policy_version(preset: Preset) -> None:
@@ -153,6 +173,11 @@ def test_a_ticket_that_was_not_issued_like_this_changes_nothing(preset: Preset) 
         dataclasses.replace(issued, index=3),
     ):
         assert verdict_of(book.close(trajectory(wrong))) is Verdict.UNASKED
+    for wrong_sender in (
+        trajectory(issued, "b"),
+        trajectory(issued, incarnation="second"),
+    ):
+        assert verdict_of(book.close(wrong_sender)) is Verdict.UNASKED
     assert verdict_of(book.close(trajectory(issued))) is Verdict.ACCEPTED
 
 
@@ -220,19 +245,26 @@ def test_dqn_tickets_carry_the_falling_epsilon() -> None:
 def test_replaying_the_events_gives_the_same_book(preset: Preset) -> None:
     book, events = TicketBook(preset), list[TicketEvent]()
     generator = np.random.default_rng(0)
-    held: list[Ticket] = []
+    held: list[tuple[Ticket, TicketRequest]] = []
     for number in range(200):
         now_secs = float(number)
         events += book.expire(now_secs)
         if held and generator.random() < 0.5:
-            ticket = held.pop(int(generator.integers(len(held))))
+            ticket, holder = held.pop(int(generator.integers(len(held))))
             guard = "nan" if generator.random() < 0.5 else None
-            events += book.close(trajectory(ticket, sequence=number, guard=guard))
+            played = trajectory(
+                ticket,
+                holder.actor,
+                sequence=number,
+                incarnation=holder.incarnation,
+                guard=guard,
+            )
+            events += book.close(played)
         else:
             request = ask(f"actor-{generator.integers(3)}", f"life-{generator.integers(3)}")
             new, more = book.issue(request, 99, now_secs)
             events += more
-            held += [new] if new else []
+            held += [(new, request)] if new else []
     replayed = TicketBook(preset)
     for event in events:
         replayed.apply(event)

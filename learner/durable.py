@@ -1,0 +1,28 @@
+"""Files that are whole or not there, also after a power cut."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+PARTIAL_SUFFIX = ".partial"
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """Writes a file under another name, syncs it, renames it, and syncs its folder.
+
+    Raises:
+        OSError: The disk refuses; the file that was there before is as it was.
+    """
+    partial = path.with_name(path.name + PARTIAL_SUFFIX)
+    with partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+    # The rename itself is durable once the folder is synced.
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
