@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -77,9 +77,14 @@ def method_preset(name: str, overrides: Sequence[str], method: Method, seed: int
 
 
 def finish_runs(
-    presets: dict[RunKey, Preset], curves: Path, work: Path, device: Device, jobs: int
+    presets: dict[RunKey, Preset],
+    curves: Path,
+    work: Path,
+    device: Device,
+    jobs: int,
+    iterations: int,
 ) -> list[FinishedRun]:
-    """Makes the runs that are not in the file yet, and adds each to it when it is finished.
+    """Makes what the file does not hold yet, and adds each run to it when it is finished.
 
     Args:
         presets: The runs, in the order in which they are started.
@@ -87,23 +92,28 @@ def finish_runs(
         work: Folder of checkpoints: an unfinished run goes on from its last iteration.
         device: What the learners compute on; actors act on the CPU.
         jobs: Runs at a time, each in a process of its own with one thread.
+        iterations: How far each run is followed; a run that was followed less far goes on.
 
     Returns:
-        All runs asked for, in the order of `presets`.
+        All runs asked for, in the order of `presets`, with as many iterations each.
 
     Raises:
         StorageError: The file cannot be read or written.
     """
     finished = {run.key: run for run in read_runs(curves)}
-    missing = {key: preset for key, preset in presets.items() if key not in finished}
-    for run in _run_side_by_side(missing, work, device, jobs):
+    missing = {
+        key: preset
+        for key, preset in presets.items()
+        if key not in finished or len(finished[key].points) < iterations
+    }
+    for run in _run_side_by_side(missing, work, device, jobs, iterations):
         finished[run.key] = run
         write_runs(curves, finished.values())
-    return [finished[key] for key in presets]
+    return [replace(finished[key], points=finished[key].points[:iterations]) for key in presets]
 
 
 def _run_side_by_side(
-    presets: dict[RunKey, Preset], work: Path, device: Device, jobs: int
+    presets: dict[RunKey, Preset], work: Path, device: Device, jobs: int, iterations: int
 ) -> Iterator[FinishedRun]:
     # A process for each run, and spawned: CUDA does not survive a fork.
     context = multiprocessing.get_context("spawn")
@@ -111,7 +121,7 @@ def _run_side_by_side(
         jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
     ) as pool:
         futures = [
-            pool.submit(_run, key, preset, work / key.name, device)
+            pool.submit(_run, key, preset, work / key.name, device, iterations)
             for key, preset in presets.items()
         ]
         try:
@@ -122,10 +132,10 @@ def _run_side_by_side(
             raise
 
 
-def _run(key: RunKey, preset: Preset, folder: Path, device: Device) -> FinishedRun:
+def _run(key: RunKey, preset: Preset, folder: Path, device: Device, iterations: int) -> FinishedRun:
     torch.set_num_threads(1)
     run = InProcessRun(preset, CheckpointStore(folder), device)
-    for point in run.finish():
+    for point in run.finish(iterations):
         line = (
             f"{key.name}: iteration {point.iteration}, greedy {point.greedy_return:.2f}, "
             f"training {point.training_return:.2f}, {point.gradient_steps} gradient steps, "

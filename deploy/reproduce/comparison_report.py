@@ -149,6 +149,7 @@ def _settings(comparison: Comparison) -> str:
         "* The area is the mean greedy return over the samples, by trapezia from the first "
         "update to the last. One greedy episode after each update is exact: the task is "
         "deterministic.",
+        f"* The first {_followed(comparison)} of the preset's {schedule.iterations} iterations.",
         "* Seeds are paired: initial weights, minibatches and the episodes' random numbers are "
         "derived from them. All runs are shown, and each run's last policy counts, not its best.",
     ]
@@ -161,6 +162,10 @@ def _settings(comparison: Comparison) -> str:
             f"`{comparison.presets[method].digest}`."
         )
     return "\n".join(lines)
+
+
+def _followed(comparison: Comparison) -> int:
+    return len(comparison.runs[comparison.subject][0].points)
 
 
 def _interval(bounds: tuple[float, float]) -> str:

@@ -72,12 +72,13 @@ class InProcessRun:
                 for point in checkpoint.extra["points"]
             ]
 
-    def finish(self) -> Iterator[CurvePoint]:
-        """Runs the iterations that are left; yields each once it is on disk."""
+    def finish(self, iterations: int | None = None) -> Iterator[CurvePoint]:
+        """Runs what is left of so many iterations, or of all; yields each once it is on disk."""
         task = self._preset.task
+        last = self._preset.schedule.iterations if iterations is None else iterations
         env = make_env(task.environment, horizon=task.horizon, **task.options)
         try:
-            while len(self.points) < self._preset.schedule.iterations:
+            while len(self.points) < last:
                 self.points.append(self._iterate(env))
                 extra = {"points": [to_plain(point) for point in self.points]}
                 self._checkpoints.save(self._trainer.get_state(), extra)

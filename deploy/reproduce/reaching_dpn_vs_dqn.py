@@ -41,6 +41,8 @@ class Arguments:
     """Name of a file in deploy/presets."""
     override: tuple[str, ...] = ()
     """Settings that replace the preset's, for example schedule.epochs=4."""
+    iterations: int | None = None
+    """How far the runs are followed; the preset's if None. They go on when it is more next time."""
     device: Device = "cpu"
     """What the learners compute on; actors act on the CPU."""
     jobs: int = 1
@@ -68,7 +70,15 @@ def reproduce(arguments: Arguments, command: str) -> list[FinishedRun]:
         for preset in (method_preset(arguments.preset, arguments.override, method, seed),)
     }
     curves = arguments.output / CURVES
-    runs = finish_runs(presets, curves, arguments.work, arguments.device, arguments.jobs)
+    planned = min(preset.schedule.iterations for preset in presets.values())
+    runs = finish_runs(
+        presets,
+        curves,
+        arguments.work,
+        arguments.device,
+        arguments.jobs,
+        min(planned, arguments.iterations or planned),
+    )
     if arguments.report:
         _report(arguments, runs, command)
     return runs

@@ -52,6 +52,17 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(tmp_path: Path, method
     assert without_time(resumed.points) == without_time(whole.points)
 
 
+def test_a_run_that_was_followed_less_far_goes_on(tmp_path: Path) -> None:
+    options = {"preset": "reaching-smoke", "seeds": 1, "methods": ("dpn",), "report": False}
+    places = {"output": tmp_path / "docs", "work": tmp_path / "work"}
+    (first,) = reproduce(Arguments(**options, **places, iterations=1), "command")
+    (second,) = reproduce(Arguments(**options, **places), "command")
+    assert (len(first.points), len(second.points)) == (1, 2)
+    assert second.points[0] == first.points[0]
+    (again,) = reproduce(Arguments(**options, **places, iterations=1), "command")
+    assert again == first
+
+
 def test_methods_get_equal_samples_and_gradient_steps(tmp_path: Path) -> None:
     budgets = set()
     for method in ("dpn", "dueling-dpn", "dqn", "dueling-dqn"):
