@@ -11,7 +11,7 @@ import pytest
 
 from actors.service import Actor
 from broker_config.bus import Bus
-from broker_config.errors import AttachRefused
+from broker_config.errors import AttachRefused, Refused
 from broker_config.keys import Kind, ParsedKey
 from broker_config.messages import (
     Ack,
@@ -45,6 +45,9 @@ class FakeOwner:
         self.asked_versions: list[int] = []
         self.acks = threading.Event()
         self.acks.set()
+        self.refuses_trajectories = False
+        self.gone_versions: set[int] = set()
+        self.given_back: list[tuple[int, int]] = []
         self._versions = versions
         self._issued: dict[str, Ticket] = {}
         bus.serve(bus.keys.every(Kind.ATTACH), Attach, self._attach)
@@ -65,6 +68,8 @@ class FakeOwner:
 
     def _ticket(self, _: ParsedKey, request: TicketRequest, to: Responder) -> None:
         self.nonces.append(request.nonce)
+        if request.gives_back is not None:
+            self.given_back.append(request.gives_back)
         index = len(self._issued)
         if request.nonce not in self._issued and index == len(self._versions):
             to.reply(TicketReply(Instruction.STOP, request.nonce, 1))
@@ -80,12 +85,18 @@ class FakeOwner:
         if not self.acks.is_set():
             to.drop()
             return
+        if self.refuses_trajectories:
+            to.reply(Refusal("trajectory", "another picture", "this one", "use one preset"))
+            return
         self.trajectories.append(trajectory)
         offset = len(self.trajectories)
         to.reply(Ack(trajectory.id, 1, offset, Verdict.ACCEPTED, duplicate=False))
 
     def _snapshot(self, _: ParsedKey, request: SnapshotRequest, to: Responder) -> None:
         self.asked_versions.append(request.version)
+        if request.version in self.gone_versions:
+            to.reply(Refusal("policy version", "another", str(request.version), "ask again"))
+            return
         to.reply(self.snapshot(request.version))
 
 
@@ -144,3 +155,25 @@ def test_an_actor_without_an_owner_can_be_stopped(make_actor: Callable[..., Acto
     actor.stop()
     thread.join(30)
     assert not thread.is_alive()
+
+
+def test_a_refused_trajectory_ends_the_actor_with_the_reason_and_stays_in_the_spool(
+    attach: Any, tmp_path: Path
+) -> None:
+    owner = FakeOwner(attach("owner", "learner"), [0] * 50)
+    owner.refuses_trajectories = True
+    with Spool(tmp_path / "spool.sqlite", "run", "actor-1", "life", 64 << 20) as spool:
+        actor = Actor(attach("actor", "actor-1"), "actor-1", spool, "life")
+        with pytest.raises(Refused, match="expected another picture; got this one"):
+            actor.run()
+        assert spool.status().trajectories >= 1
+
+
+def test_a_ticket_whose_policy_is_gone_is_given_back(
+    attach: Any, make_actor: Callable[..., Actor]
+) -> None:
+    owner = FakeOwner(attach("owner", "learner"), [0, 3, 2])
+    owner.gone_versions = {3}
+    make_actor().run()
+    assert owner.given_back == [(1, 0)]
+    assert [it.ticket.policy_version for it in owner.trajectories] == [0, 2]
