@@ -220,7 +220,7 @@ def status(
 
 @app.command(name="control")
 def control(
-    command: Annotated[Command, tyro.conf.Positional],
+    command: Annotated[Literal["pause", "resume", "drain", "stop"], tyro.conf.Positional],
     /,
     connect: str = DEFAULT_ADDRESS,
     run: str | None = None,
@@ -240,7 +240,7 @@ def control(
 
     address = _address(connect)
     name = run or _only_run(address, zenoh)
-    reply = send_control(address, name, command, actor, zenoh)
+    reply = send_control(address, name, Command(command), actor, zenoh)
     Console().print(f"{name}: {reply.state}", highlight=False)
 
 

@@ -101,7 +101,7 @@ def test_ctrl_c_ends_everything_and_the_run_can_be_resumed(start: Start, tmp_pat
 
 
 @pytest.mark.timeout(200)
-def test_status_names_a_hung_process_and_all_end_with_a_killed_supervisor(
+def test_control_status_of_a_hung_process_and_a_killed_supervisor(
     start: Start, tmp_path: Path, wait_until
 ) -> None:
     run = start("run", *arguments(tmp_path / "run", "--actors", 1, "schedule.iterations=200"))
@@ -109,6 +109,10 @@ def test_status_names_a_hung_process_and_all_end_with_a_killed_supervisor(
     wait_for_trajectories(folder, 1)
     pids = [heartbeat_pid(folder, name) for name in ("actor-0", "learner")]
     address = (folder / "router.address").read_text().strip()
+    for command, state in {"pause": "paused", "resume": "running"}.items():
+        control = start(command, "control", command, "--connect", folder)
+        assert control.wait(30) == 0
+        assert f"{folder.name}: {state}" in control.log.read_text()
     os.kill(pids[0], signal.SIGSTOP)
     states = {it.id: it.heartbeat for it in read_status(address, folder.name)}
     os.kill(pids[0], signal.SIGCONT)
