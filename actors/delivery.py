@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from broker_config.bus import Bus
 from broker_config.errors import BusError, OwnerUnreachable
+from broker_config.failpoints import Failpoint, reach
 from broker_config.messages import Ack, TrajectoryId
 from broker_config.queries import PendingReply
 from broker_config.spool import Spool
@@ -26,8 +27,18 @@ RETRY_SECS = 0.5
 class Delivery:
     """A thread that empties the spool into the owner's journal, oldest first."""
 
-    def __init__(self, bus: Bus, spool: Spool, key: str) -> None:
+    def __init__(self, bus: Bus, spool: Spool, key: str, owner_epoch: Callable[[], int]) -> None:
+        """Prepares it; as a context it delivers.
+
+        Args:
+            bus: The actor's.
+            spool: What it empties.
+            key: Where the owner takes trajectories.
+            owner_epoch: Says which owner the actor has joined; the ack of an earlier one, which is
+                perhaps cut off from the run, is not believed.
+        """
         self._bus = bus
+        self._owner_epoch = owner_epoch
         self._spool = spool
         self._key = key
         self._changed = threading.Condition()
@@ -102,6 +113,7 @@ class Delivery:
             reply = self._bus.ask_later(
                 self._key, spooled.payload, Ack, timeout_secs=ACK_TIMEOUT_SECS
             )
+            reach(Failpoint.TRAJECTORY_SENT)
             window.append((spooled.id, reply))
             if len(window) == WINDOW:
                 complete &= self._settle(*window.popleft())
@@ -119,8 +131,10 @@ class Delivery:
         except BusError as error:
             _log.error("Trajectory %s refused: %s", id_, error)
             raise
-        if ack.id != id_:
+        if ack.id != id_ or ack.owner_epoch < self._owner_epoch():
+            _log.warning("Not believed: %s, for trajectory %s", ack, id_)
             return False
+        reach(Failpoint.ACK_RECEIVED)
         self._spool.acknowledge(id_)
         return True
 

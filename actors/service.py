@@ -24,7 +24,8 @@ from actors.task import make_task_env
 from broker_config.bus import Bus
 from broker_config.codec import SCHEMA_VERSION
 from broker_config.errors import AttachRefused, OwnerUnreachable, Refused, SpoolFull
-from broker_config.heart import Heart
+from broker_config.failpoints import Failpoint, reach
+from broker_config.heart import Heart, Pulse
 from broker_config.messages import (
     Attach,
     Instruction,
@@ -98,6 +99,7 @@ class Actor:
         self._keys = bus.keys
         self._incarnation = incarnation
         self._stop = threading.Event()
+        self._pulse = Pulse()
         self._owner_epoch = 0
         self.state = "attaching"
         self._policy: tuple[int, ActingPolicy] | None = None
@@ -127,10 +129,14 @@ class Actor:
             self._name,
             self._incarnation,
             lambda: (self.state, self._numbers()),
+            self._pulse,
         )
         key = self._keys.trajectory(self._name)
         try:
-            with heart, Delivery(self._bus, self._spool, key) as delivery:
+            with (
+                heart,
+                Delivery(self._bus, self._spool, key, lambda: self._owner_epoch) as delivery,
+            ):
                 delivery.flush(lambda: not self._stop.is_set())
                 try:
                     self._act(env, preset, delivery)
@@ -154,6 +160,7 @@ class Actor:
                 self._leave(delivery, reply.instruction)
                 return
             if reply.ticket is not None:
+                reach(Failpoint.TICKET_RECEIVED)
                 try:
                     policy = self._exact_policy(preset, reply.ticket, policies.get())
                 except Refused as error:
@@ -210,6 +217,7 @@ class Actor:
     def _insist(self, ask: Callable[[], R]) -> R:
         """Asks until the owner answers: a simulator can wait for as long as it takes."""
         while not self._stop.is_set():
+            self._pulse.beat()
             try:
                 return ask()
             except OwnerUnreachable as error:
@@ -254,6 +262,7 @@ class Actor:
         for step in events:
             assert isinstance(step, Step)
             steps.append(step)
+            self._pulse.beat()
             if self._spool_steps:
                 self._spool.append_step(
                     step.action,
@@ -267,15 +276,18 @@ class Actor:
             is_over = step.terminated or step.truncated or len(steps) == ticket.steps
             if self._stop.is_set() and not is_over:
                 raise StopRequested
+        reach(Failpoint.EPISODE_PLAYED)
         if self._spool_steps:
             self._spool.finish()
-            return
-        trajectory = to_trajectory(id_, ticket, start, steps)
-        self._when_there_is_room(lambda: self._spool.put(trajectory))
+        else:
+            trajectory = to_trajectory(id_, ticket, start, steps)
+            self._when_there_is_room(lambda: self._spool.put(trajectory))
+        reach(Failpoint.EPISODE_SPOOLED)
 
     def _when_there_is_room(self, add: Callable[[], None]) -> None:
         """Adds to the spool; while it is full, waits for the owner to take something from it."""
         while not self._stop.is_set():
+            self._pulse.beat()
             try:
                 return add()
             except SpoolFull as error:

@@ -10,7 +10,7 @@ from broker_config import messages
 from broker_config.errors import DecodeError, MessageError, SchemaMismatch
 from broker_config.structure import from_plain, to_plain
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Raised with every change that an older process would misread."""
 
 KIB, MIB = 1 << 10, 1 << 20
@@ -21,6 +21,7 @@ SIZE_LIMITS: dict[type, int] = {
     messages.Refusal: 16 * KIB,
     messages.Heartbeat: 16 * KIB,
     messages.Metrics: 64 * KIB,
+    messages.View: 256 * KIB,
     messages.TicketRequest: 4 * KIB,
     messages.TicketReply: 4 * KIB,
     messages.Trajectory: 64 * MIB,
@@ -28,6 +29,7 @@ SIZE_LIMITS: dict[type, int] = {
     messages.Snapshot: 256 * MIB,
     messages.SnapshotRequest: 4 * KIB,
     messages.JournalRequest: 4 * KIB,
+    messages.JournalEntry: 65 * MIB,
     messages.JournalBatch: 96 * MIB,
     messages.Control: 4 * KIB,
     messages.ControlReply: 4 * KIB,
@@ -37,6 +39,10 @@ SIZE_LIMITS: dict[type, int] = {
     messages.TicketReseeded: 4 * KIB,
     messages.SnapshotTaken: 4 * KIB,
     messages.IterationEnded: 4 * KIB,
+    messages.FollowerJoined: 4 * KIB,
+    messages.RecorderStarted: 4 * KIB,
+    messages.RecordingGap: 4 * KIB,
+    messages.Presence: 4 * KIB,
 }
 """Every message there is, and how many bytes it may take; more is refused at either end."""
 

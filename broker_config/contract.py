@@ -127,10 +127,20 @@ CONTRACT: tuple[Row, ...] = (
         messages=(messages.Metrics,),
         replies=(),
         publisher="any process",
-        consumer="observers",
+        consumer="recorder, observers",
         delivery=Delivery.BEST_EFFORT,
         quality=Quality("drop", "data_low", is_express=False, is_reliable=False),
         why="only looked at; nothing may wait for a viewer",
+    ),
+    Row(
+        kind=Kind.VIEW,
+        messages=(messages.View,),
+        replies=(),
+        publisher="actor",
+        consumer="recorder, observers",
+        delivery=Delivery.BEST_EFFORT,
+        quality=Quality("drop", "data_low", is_express=False, is_reliable=False),
+        why="pictures to look at; sequence numbers tell what was dropped",
     ),
     Row(
         kind=Kind.LIVE,
@@ -181,9 +191,14 @@ def _sender_of(message: object) -> tuple[str | None, str | None]:
     match message:
         case messages.Trajectory():
             return "actor", message.id.actor
-        case messages.TicketRequest():
+        case messages.TicketRequest() | messages.View():
             return "actor", message.actor
-        case messages.Attach() | messages.Heartbeat() | messages.Metrics():
+        case (
+            messages.Attach()
+            | messages.Heartbeat()
+            | messages.Metrics()
+            | messages.JournalRequest()
+        ):
             return message.role, message.id
         case _:
             return None, None

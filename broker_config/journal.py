@@ -11,6 +11,7 @@ from __future__ import annotations
 import queue
 import sqlite3
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -33,13 +34,13 @@ JOURNAL_FILE = "journal.sqlite"
 _SCHEMA = Schema(
     subject="journal",
     application_id=0x636C6F6A,  # "cloj"
-    version=1,
+    version=2,
     statements=(
         "CREATE TABLE entries (offset INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE,"
-        " payload BLOB NOT NULL)",
+        " payload BLOB NOT NULL, unix_secs REAL NOT NULL)",
     ),
 )
-_SELECT = "SELECT offset, name, payload FROM entries"
+_SELECT = "SELECT offset, name, payload, unix_secs FROM entries"
 _GROUP_ENTRIES, _GROUP_BYTES = 1000, 32 << 20
 """A commit takes no more than this, so that the first of a burst does not wait for the last."""
 _ITERATION_BYTES = 4 << 20
@@ -296,7 +297,9 @@ class Journal(JournalReader):
         if (row := found.fetchone()) is not None:
             return Appended(int(row[0]), is_new=False)
         offset = self._next_offset
-        self._connection.execute("INSERT INTO entries VALUES (?, ?, ?)", [offset, name, payload])
+        self._connection.execute(
+            "INSERT INTO entries VALUES (?, ?, ?, ?)", [offset, name, payload, time.time()]
+        )
         self._next_offset += 1
         return Appended(offset, is_new=True)
 

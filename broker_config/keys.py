@@ -20,10 +20,11 @@ class Kind(StrEnum):
     ATTACH = "<run>/attach/<role>/<id>"
     TICKET = "<run>/ticket/<actor>"
     TRAJECTORY = "<run>/trajectory/<actor>"
-    JOURNAL = "<run>/journal"
+    JOURNAL = "<run>/journal/<role>/<id>"
     POLICY = "<run>/policy"
     POLICY_VERSION = "<run>/policy/<version>"
     METRICS = "<run>/metrics/<role>/<id>"
+    VIEW = "<run>/view/<actor>"
     LIVE = "<run>/live/<role>/<id>"
     CONTROL = "<run>/control"
 
@@ -44,7 +45,7 @@ class ParsedKey:
     run: str
     kind: Kind
     role: Role | None = None
-    """With `attach`, `metrics` and `live`; `actor` with `ticket` and `trajectory`."""
+    """Of the process that the key belongs to; `actor` wherever the template has no role."""
     id: str | None = None
     """Of the process that the key belongs to."""
     version: int | None = None
@@ -87,10 +88,9 @@ class RunKeys:
         """Where an actor delivers."""
         return self._of_process(Kind.TRAJECTORY, "actor", actor)
 
-    @property
-    def journal(self) -> str:
-        """Where followers pull the journal."""
-        return str(ParsedKey(self.run, Kind.JOURNAL))
+    def journal(self, role: Role, process_id: str) -> str:
+        """Where a follower pulls the journal."""
+        return self._of_process(Kind.JOURNAL, role, process_id)
 
     @property
     def policy(self) -> str:
@@ -106,6 +106,10 @@ class RunKeys:
     def metrics(self, role: Role, process_id: str) -> str:
         """Where a process publishes its numbers."""
         return self._of_process(Kind.METRICS, role, process_id)
+
+    def view(self, actor: str) -> str:
+        """Where an actor shows what it sees."""
+        return self._of_process(Kind.VIEW, "actor", actor)
 
     def live(self, role: Role, process_id: str) -> str:
         """A process's liveliness token, and its heartbeat."""

@@ -220,27 +220,28 @@ def status(
 
 @app.command(name="control")
 def control(
-    command: Annotated[Literal["pause", "resume", "drain", "stop"], tyro.conf.Positional],
+    command: Annotated[Literal["pause", "resume", "drain", "stop", "forget"], tyro.conf.Positional],
     /,
     connect: str = DEFAULT_ADDRESS,
     run: str | None = None,
-    actor: str | None = None,
+    process: str | None = None,
     zenoh: tuple[str, ...] = (),
 ) -> None:
-    """Pause, resume, drain or stop a run.
+    """Pause, resume, drain or stop a run, or forget a recorder.
 
     Args:
-        command: What to do; `drain` has actors deliver and leave.
+        command: What to do; `drain` has actors deliver and leave, `forget` keeps no policy versions
+            any more for a recorder that will not come back.
         connect: Address of the router, or a run folder that `clothbus run` made.
         run: The run's name; not needed when the router carries one run.
-        actor: The actor to drain; all of them if not given.
+        process: The actor to drain, the recorder to forget; all of them if not given.
         zenoh: Zenoh settings, each key/path=value.
     """
     from deploy.status import send_control
 
     address = _address(connect)
     name = run or _only_run(address, zenoh)
-    reply = send_control(address, name, Command(command), actor, zenoh)
+    reply = send_control(address, name, Command(command), process, zenoh)
     Console().print(f"{name}: {reply.state}", highlight=False)
 
 

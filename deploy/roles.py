@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 from broker_config.bus import open_bus
+from broker_config.heart import Pulse
 from broker_config.journal import Journal
 from broker_config.ownership import own_run
 from broker_config.preset import Preset
@@ -69,7 +70,7 @@ def run_learner(
         StorageError: The folder cannot be used.
     """
     from learner.checkpoint import CheckpointStore
-    from learner.learning import LearningLoop
+    from learner.learning import WAIT_SECS, LearningLoop
     from learner.metrics import LearningMetrics
     from learner.owner import Owner
     from learner.recorded import read_demonstrations
@@ -87,14 +88,21 @@ def run_learner(
     ):
         owner = Owner(folder.run, preset, journal)
         snapshots = SnapshotStore(folder.snapshots)
+        pulse = Pulse()
+
+        def wait_ready(index: int) -> bool:
+            pulse.beat()
+            return owner.wait_ready(index, WAIT_SECS)
+
         loop = LearningLoop(
             owner,
-            Trainer(preset, device),
+            Trainer(preset, device, pulse.beat),
             CheckpointStore(folder.checkpoints),
             snapshots,
             read_demonstrations(demonstrations) if demonstrations else (),
+            wait_ready,
         )
-        LearnerService(bus, "learner", owner, loop, journal, snapshots, metrics).run()
+        LearnerService(bus, "learner", owner, loop, journal, snapshots, metrics, pulse).run()
 
 
 def run_actor(

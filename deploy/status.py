@@ -52,7 +52,7 @@ def send_control(
     address: str,
     run: str,
     command: Command,
-    actor: str | None = None,
+    process: str | None = None,
     overrides: tuple[str, ...] = (),
 ) -> ControlReply:
     """Has the owner of a run do something.
@@ -62,7 +62,7 @@ def send_control(
         RouterUnreachable: There is no router at the address.
     """
     with open_bus(address, run, "observer", "control", overrides) as bus:
-        request = Control(command, actor)
+        request = Control(command, process)
         return bus.ask(bus.keys.control, request, ControlReply, timeout_secs=CONTROL_TIMEOUT_SECS)
 
 

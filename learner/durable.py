@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from broker_config.failpoints import Failpoint, reach
+
 PARTIAL_SUFFIX = ".partial"
 
 
@@ -19,6 +21,7 @@ def write_durably(path: Path, data: bytes) -> None:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
+    reach(Failpoint.FILE_WRITTEN)
     partial.replace(path)
     # The rename itself is durable once the folder is synced.
     folder = os.open(path.parent, os.O_RDONLY)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from broker_config.errors import PresetError
+from broker_config.failpoints import Failpoint, reach
 from broker_config.messages import (
     IterationEnded,
     Snapshot,
@@ -104,9 +105,11 @@ class LearningLoop:
                     return
                 continue
             yield self._absorb()
+            reach(Failpoint.EPISODE_ABSORBED)
             if self._schedule.updates_after(self._absorbed - 1):
                 self._report = self._trainer.update()
                 self._version += 1
+                reach(Failpoint.POLICY_UPDATED)
                 self._save_checkpoint()
                 yield self._make_known()
 
@@ -181,6 +184,7 @@ class LearningLoop:
     def _save_checkpoint(self) -> None:
         extra = {"absorbed": self._absorbed, "version": self._version}
         self._checkpoints.save(self._trainer.get_state(), extra)
+        reach(Failpoint.CHECKPOINT_SAVED)
 
     def _make_known(self) -> PolicyReady:
         """Stores and journals the current policy; doing it twice changes nothing."""
@@ -193,11 +197,16 @@ class LearningLoop:
             weights_digest(weights),
         )
         self._snapshots.put(snapshot.version, weights)
+        reach(Failpoint.SNAPSHOT_STORED)
         per_iteration = self._schedule.episodes_per_iteration
         if self._absorbed and self._absorbed % per_iteration == 0:
             self._owner.iteration_ended(self._iteration(self._absorbed // per_iteration - 1))
+            reach(Failpoint.ITERATION_JOURNALED)
         self._owner.policy_ready(SnapshotTaken(self._version, snapshot.digest, self._absorbed))
-        self._snapshots.retain(self._schedule.policy_lag + 2, self._pinned_versions())
+        reach(Failpoint.SNAPSHOT_JOURNALED)
+        # Whoever records gets every version, however far behind it is.
+        wanted = self._pinned_versions() | self._owner.followers.missing_versions()
+        self._snapshots.retain(self._schedule.policy_lag + 2, wanted)
         report, self._report = self._report, None
         return PolicyReady(snapshot, self._absorbed, report)
 

@@ -14,6 +14,7 @@ after a crash:
 `snapshot/<version>/<digest>`         `SnapshotTaken`
 `iteration/<number>`                  `IterationEnded`
 `control/<epoch>/<number>`            `Control`
+`follower/<id>/<epoch>/<number>`      `FollowerJoined`
 ====================================  ==============================================================
 """
 
@@ -35,8 +36,11 @@ from broker_config.messages import (
     Command,
     Control,
     ControlReply,
+    FollowerJoined,
     Instruction,
     IterationEnded,
+    JournalBatch,
+    JournalRequest,
     Refusal,
     RunStarted,
     SnapshotTaken,
@@ -52,6 +56,7 @@ from broker_config.messages import (
 )
 from broker_config.preset import Preset
 from broker_config.version import VERSION
+from learner.followers import Followers
 from learner.recorded import trajectory_name
 from learner.tickets import TicketBook, TicketEvent
 
@@ -87,6 +92,9 @@ class Owner:
         self._stopping = False
         self._draining: set[str] = set()
         self._controls = 0
+        self._joins = 0
+        self._is_over = False
+        self.followers = Followers()
         self._failure: ClothbusError | None = None
         self.attempts: Counter[Verdict] = Counter()
         self.epoch = self._replay() + 1
@@ -189,6 +197,7 @@ class Owner:
         self._journal.wait_for_room()
         with self.changed:
             self._require_sound()
+            self._require_going_on()
             known = self._book.verdict(trajectory.id)
             events = [] if known else self._book.close(trajectory)
             verdict = known or self._book.verdict(trajectory.id)
@@ -288,7 +297,9 @@ class Owner:
 
     def policy_ready(self, snapshot: SnapshotTaken) -> None:
         """Journals a policy version; from then on tickets may name it."""
-        self._append((f"snapshot/{snapshot.version}/{snapshot.digest[:16]}", snapshot)).result()
+        name = f"snapshot/{snapshot.version}/{snapshot.digest[:16]}"
+        (appended,) = self._append((name, snapshot)).result()
+        self.followers.snapshot_taken(snapshot, appended.offset)
         with self.changed:
             self._latest_version = snapshot.version
             self.note_change()
@@ -296,6 +307,47 @@ class Owner:
     def iteration_ended(self, iteration: IterationEnded) -> None:
         """Journals the end of an iteration."""
         self._append((f"iteration/{iteration.iteration}", iteration)).result()
+
+    # Followers --------------------------------------------------------------------------------
+
+    def follow(self, request: JournalRequest, max_bytes: int, now_secs: float) -> JournalBatch:
+        """Gives a follower the next entries; a new one becomes part of the run's record.
+
+        Raises:
+            StorageError: The journal cannot be read or written.
+        """
+        if not self.followers.is_known(request.id):
+            self._join(FollowerJoined(request.role, request.id))
+        self.followers.heard(request, now_secs)
+        # First what is final, then how far it goes: an entry in between shows in the end offset.
+        is_over = self._is_over
+        end_offset = self._journal.end_offset
+        entries = self._journal.read(request.offset, min(request.max_bytes, max_bytes))
+        return JournalBatch(self.epoch, entries, end_offset, is_over)
+
+    def _join(self, joined: FollowerJoined) -> None:
+        with self.changed:
+            self._require_sound()
+            self._joins += 1
+            future = self._append((f"follower/{joined.id}/{self.epoch}/{self._joins}", joined))
+        future.result()
+        self.followers.apply(joined)
+
+    def close_record(self) -> int:
+        """Takes nothing more, so that followers can come to an end; returns the end offset.
+
+        What actors still hold stays in their spools, for the next start.
+        """
+        with self.changed:
+            self._is_over = True
+        return self._journal.end_offset
+
+    def _require_going_on(self) -> None:
+        if self._is_over:
+            raise StorageError(
+                f"run {self.run}: expected a run that goes on; got one that is over; the "
+                "trajectory stays in the actor's spool, for when the run is resumed"
+            )
 
     # Control ----------------------------------------------------------------------------------
 
@@ -330,7 +382,9 @@ class Owner:
                 self._paused = False
                 self._draining.clear()
             case Command.DRAIN:
-                self._draining.update([control.actor] if control.actor else actors)
+                self._draining.update([control.process] if control.process else actors)
+            case Command.FORGET:
+                self.followers.forget(control.process)
             case Command.STOP:
                 self._stopping = True
 
@@ -393,8 +447,12 @@ class Owner:
                     self._book.apply(event)
                     if isinstance(event, AttemptEnded) and event.trajectory is not None:
                         self._stored.add(event.trajectory)
-                case Control(command=Command.PAUSE | Command.RESUME) as control:
+                case Control(command=Command.PAUSE | Command.RESUME | Command.FORGET) as control:
                     self._apply_control(control, ())
+                case FollowerJoined() as joined:
+                    self.followers.apply(joined)
+                case SnapshotTaken() as snapshot:
+                    self.followers.snapshot_taken(snapshot, entry.offset)
         return epoch
 
     def _refuse_other_preset(self, started: RunStarted) -> None:

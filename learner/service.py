@@ -10,7 +10,8 @@ from contextlib import ExitStack
 from broker_config.bus import Bus, Publisher
 from broker_config.codec import encode
 from broker_config.errors import AlreadyOwned, BusError
-from broker_config.heart import Heart
+from broker_config.failpoints import Failpoint, reach
+from broker_config.heart import HUNG_SECS, Heart, Pulse
 from broker_config.journal import Journal
 from broker_config.keys import Kind, ParsedKey
 from broker_config.messages import (
@@ -18,7 +19,6 @@ from broker_config.messages import (
     Attach,
     Control,
     Heartbeat,
-    JournalBatch,
     JournalRequest,
     Metrics,
     Refusal,
@@ -45,6 +45,9 @@ FAREWELL_SECS = 10.0
 SILENCE_SECS = 1.5
 """Three heartbeats: a process that was not heard of for so long has left its name."""
 
+FOLLOWER_SECS = 15.0
+"""How long a finished learner waits for a word of a follower that lacks something."""
+
 TOKEN_SECS = 3.0
 """A killed process's token is gone by then."""
 
@@ -64,7 +67,20 @@ class LearnerService:
         journal: Journal,
         snapshots: SnapshotStore,
         metrics: LearningMetrics,
+        pulse: Pulse,
     ) -> None:
+        """Joins the parts.
+
+        Args:
+            bus: Its place on the bus.
+            name: Under which it is there.
+            owner: Of the run.
+            loop: What it does.
+            journal: The owner's.
+            snapshots: The loop's.
+            metrics: Where the numbers go.
+            pulse: Beaten by the loop's trainer too, so that a long update is no stall.
+        """
         self._bus = bus
         self._name = name
         self._owner = owner
@@ -72,6 +88,7 @@ class LearnerService:
         self._journal = journal
         self._snapshots = snapshots
         self._metrics = metrics
+        self._pulse = pulse
         self._keys = bus.keys
         self._state = "starting"
         self._heard: dict[str, tuple[str, float]] = {}
@@ -91,23 +108,28 @@ class LearnerService:
                     self._name,
                     incarnation,
                     lambda: (self._state, self._numbers()),
+                    self._pulse,
                 )
             )
             policies = self._bus.latest_publisher(self._keys.policy)
             metrics = self._bus.publisher(self._keys.metrics("owner", self._name))
-            self._learn(policies, metrics)
+            self._learn(policies, metrics, incarnation)
             self._state = "finished"
             self._wait_for_farewells()
+            self._wait_for_followers(self._owner.close_record())
 
-    def _learn(self, policies: Publisher, metrics: Publisher) -> None:
+    def _learn(self, policies: Publisher, metrics: Publisher, incarnation: str) -> None:
         self._state = "waiting for actors"
-        for event in self._loop:
+        for sequence, event in enumerate(self._loop):
+            self._pulse.beat()
             if isinstance(event, PolicyReady):
                 policies.put(event.snapshot)
+                reach(Failpoint.SNAPSHOT_PUBLISHED)
             else:
                 self._state = "learning"
             self._metrics.note(event)
-            metrics.put(Metrics("owner", self._name, self._metrics.step, self._numbers()))
+            step, numbers = self._metrics.step, self._numbers()
+            metrics.put(Metrics("owner", self._name, incarnation, sequence, step, numbers))
 
     def _numbers(self) -> dict[str, float]:
         attempts = self._owner.attempts
@@ -120,9 +142,19 @@ class LearnerService:
         deadline_secs = time.monotonic() + FAREWELL_SECS
         try:
             while time.monotonic() < deadline_secs and self._alive("actor"):
+                self._pulse.beat()
                 time.sleep(POLL_SECS)
         except BusError as error:
             _log.warning("Leaving without a farewell: %s", error)
+
+    def _wait_for_followers(self, end_offset: int) -> None:
+        """Stays until whoever records has everything, or says nothing any more."""
+        followers = self._owner.followers
+        followers.expect(time.monotonic())
+        while behind := followers.behind(end_offset, time.monotonic() - FOLLOWER_SECS):
+            self._state = f"waiting for {', '.join(behind)}"
+            self._pulse.beat()
+            time.sleep(POLL_SECS)
 
     def _refuse_second_owner(self) -> None:
         """Two owners of one run name would each get a part of what actors send.
@@ -150,7 +182,7 @@ class LearnerService:
         bus.serve(keys.every(Kind.ATTACH), Attach, self._on_attach)
         bus.serve(keys.every(Kind.TRAJECTORY), Trajectory, self._on_trajectory)
         bus.serve(keys.every(Kind.POLICY_VERSION), SnapshotRequest, self._on_snapshot_request)
-        bus.serve(keys.journal, JournalRequest, self._on_journal_request)
+        bus.serve(keys.every(Kind.JOURNAL), JournalRequest, self._on_journal_request)
         bus.serve(keys.control, Control, self._on_control)
 
         bus.serve(
@@ -163,6 +195,8 @@ class LearnerService:
         if heartbeat.role == "actor":
             now_secs = time.monotonic()
             self._heard[heartbeat.id] = heartbeat.incarnation, now_secs
+            if heartbeat.stalled_secs > HUNG_SECS:
+                return  # its tickets go to others
             self._owner.heard(heartbeat.id, heartbeat.incarnation, now_secs)
 
     def _on_attach(self, _: ParsedKey, request: Attach, to: Responder) -> None:
@@ -186,8 +220,10 @@ class LearnerService:
             if isinstance(error, Exception):
                 to.fail(error)
             else:
+                reach(Failpoint.TRAJECTORY_JOURNALED)
                 to.reply(ack.result())
 
+        reach(Failpoint.TRAJECTORY_RECEIVED)
         self._owner.receive(trajectory, encode(trajectory)).add_done_callback(answer)
 
     def _on_snapshot_request(self, _: ParsedKey, request: SnapshotRequest, to: Responder) -> None:
@@ -207,9 +243,7 @@ class LearnerService:
         to.reply(Snapshot(request.version, epoch, spec, weights, weights_digest(weights)))
 
     def _on_journal_request(self, _: ParsedKey, request: JournalRequest, to: Responder) -> None:
-        size = min(request.max_bytes, MAX_BATCH_BYTES)
-        entries = self._journal.read(request.offset, size)
-        to.reply(JournalBatch(self._owner.epoch, entries, self._journal.end_offset))
+        to.reply(self._owner.follow(request, MAX_BATCH_BYTES, time.monotonic()))
 
     def _on_control(self, _: ParsedKey, control: Control, to: Responder) -> None:
         to.reply(self._owner.control(control, list(self._heard)))

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from broker_config.failpoints import Failpoint, reach
 from broker_config.messages import TicketReply, TicketRequest
 from learner.owner import Owner
 
@@ -96,6 +97,7 @@ class TicketDesk:
         if issued is not None:
             reply, committed = issued
             committed.result()
+            reach(Failpoint.TICKET_JOURNALED)
             held.answer(reply)
             return True
         if now_secs >= held.deadline_secs:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
@@ -39,6 +39,8 @@ from learner.teaching_signal import (
 
 _EVALUATED_AT_ONCE = 128
 """Pictures for which preferences are computed at a time."""
+_STEPS_AT_ONCE = 256
+"""Gradient steps between two calls of `on_step`."""
 _WEIGHTS_STREAM, _SHUFFLING_STREAM = 0, 1
 """Independent random numbers of one preset seed."""
 
@@ -102,8 +104,18 @@ class Trainer:
     with one number of threads; on a GPU they are equal up to rounding.
     """
 
-    def __init__(self, preset: Preset, device: str = "cpu") -> None:
+    def __init__(
+        self, preset: Preset, device: str = "cpu", on_step: Callable[[], None] = lambda: None
+    ) -> None:
+        """Makes the untrained policy.
+
+        Args:
+            preset: What is learned, and how.
+            device: Where: cpu, cuda.
+            on_step: Called every few seconds of an update, to show that it gets on.
+        """
         self._preset = preset
+        self._on_step = on_step
         algorithm, schedule = preset.algorithm, preset.schedule
         self._network = build_network(
             preset.network,
@@ -273,7 +285,11 @@ class Trainer:
             for _ in range(n_epochs)
         ]
         self._counters.gradient_steps += n_epochs * n_batches
-        return self._steps.run(torch.cat(orders).view(-1, batch_size), teaching_signals)
+        losses = []
+        for batches in torch.split(torch.cat(orders).view(-1, batch_size), _STEPS_AT_ONCE):
+            losses.append(self._steps.run(batches, teaching_signals))
+            self._on_step()
+        return torch.cat(losses)
 
     @torch.no_grad()
     def _assess(self) -> _Assessment:

@@ -10,6 +10,7 @@ import time
 import pytest
 import zenoh
 
+from broker_config.codec import SCHEMA_VERSION
 from broker_config.errors import MessageError, OwnerFailed, Refused
 from broker_config.keys import Kind
 from broker_config.liveliness import runs_on
@@ -23,12 +24,19 @@ from broker_config.messages import (
     SnapshotRequest,
     TicketRequest,
     Trajectory,
+    View,
     Welcome,
 )
 from broker_config.session import open_session
 from broker_config.specs import NetworkSpec
 
-GARBAGE = [b"", b"\x00", b"\xc1" * 50, b"not msgpack at all", b"\x93\x01\xa6Ticket\x80"]
+GARBAGE = [
+    b"",
+    b"\x00",
+    b"\xc1" * 50,
+    b"not msgpack at all",
+    bytes([0x93, SCHEMA_VERSION]) + b"\xa6Ticket\x80",
+]
 
 
 def make_snapshot(version, size=1000, owner_epoch=1):
@@ -98,10 +106,10 @@ def test_a_stopped_viewer_delays_nobody(router, run_name, attach, wait_until):
         numbers = {f"{index:03}-{'x' * 200}": 0.0 for index in range(250)}  # 50 KB
         started = time.monotonic()
         for step in range(400):  # 20 MB: far more than the stopped viewer's buffers hold
-            publisher.put(Metrics("actor", "a", step, numbers))
+            publisher.put(Metrics("actor", "a", "inc-1", step, step, numbers))
 
         def newest_arrives():
-            publisher.put(Metrics("actor", "a", 400, {}))
+            publisher.put(Metrics("actor", "a", "inc-1", 400, 400, {}))
             return steps and steps[-1] == 400
 
         wait_until(newest_arrives, "the healthy reader has the newest message")
@@ -133,7 +141,7 @@ def test_heartbeats_travel_on_the_key_of_the_token(attach, wait_until):
     owner.subscribe(owner.keys.every(Kind.LIVE), Heartbeat, lambda key, beat: seen.append(beat))
     actor.declare_alive()
     owner.alive()
-    beat = Heartbeat("actor", "a", "inc-1", "host", 1, "collecting", {"spooled": 0.0})
+    beat = Heartbeat("actor", "a", "inc-1", "host", 1, "collecting", 0.0, {"spooled": 0.0})
     publisher = actor.publisher(actor.keys.live("actor", "a"))
 
     def beat_arrives():
@@ -170,7 +178,8 @@ def keys_of(bus):
         Kind.ATTACH: keys.attach("actor", "a"),
         Kind.TICKET: keys.ticket("a"),
         Kind.TRAJECTORY: keys.trajectory("a"),
-        Kind.JOURNAL: keys.journal,
+        Kind.JOURNAL: keys.journal("recorder", "recorder"),
+        Kind.VIEW: keys.view("actor-1"),
         Kind.POLICY: keys.policy,
         Kind.POLICY_VERSION: keys.policy_version(3),
         Kind.METRICS: keys.metrics("actor", "a"),
@@ -189,6 +198,7 @@ def test_garbage_on_every_key_is_counted_and_nothing_dies(router, attach, wait_u
         owner.serve(owner.keys.every(kind), request_type, never)
     owner.subscribe(owner.keys.every(Kind.METRICS), Metrics, never)
     owner.subscribe(owner.keys.every(Kind.LIVE), Heartbeat, never)
+    owner.subscribe(owner.keys.every(Kind.VIEW), View, never)
     reader = owner.latest_reader(owner.keys.policy, Snapshot)
     owner.alive()
     keys = keys_of(owner)

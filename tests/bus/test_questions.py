@@ -197,7 +197,9 @@ def test_a_trajectory_under_another_actors_key_is_refused(owner, actor, make_tra
 
 def test_requests_and_replies_keep_to_the_contract(owner, actor, ask_ticket):
     with pytest.raises(MessageError, match="expected a message of the contract; got Metrics"):
-        actor.ask(actor.keys.control, Metrics("actor", "a", 0, {}), ControlReply, timeout_secs=1)
+        actor.ask(
+            actor.keys.control, Metrics("actor", "a", "i", 0, 0, {}), ControlReply, timeout_secs=1
+        )
 
     def answer(key, request, responder):
         responder.reply(ControlReply(Command.PAUSE, "paused"))

@@ -243,8 +243,8 @@ def test_files_that_are_no_journal_are_refused(path, tmp_path):
 def test_a_journal_of_another_schema_version_is_refused(path):
     Journal(path).close()
     with sqlite3.connect(path) as connection:
-        connection.execute("PRAGMA user_version=2")
+        connection.execute("PRAGMA user_version=3")
     connection.close()
     for kind in (Journal, JournalReader):
-        with pytest.raises(StorageError, match="expected schema version 1; got 2"):
+        with pytest.raises(StorageError, match="expected schema version 2; got 3"):
             kind(path)
