@@ -12,12 +12,12 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Protocol, Self, TypeVar
+from typing import Protocol, TypeVar
 
 import zenoh
 import zenoh.ext
 
+from broker_config.closing import Closing
 from broker_config.codec import decode, encode
 from broker_config.contract import Delivery, Row, check_sender, row_of
 from broker_config.errors import BusError, MessageError
@@ -80,7 +80,7 @@ class Publisher:
         self._publisher.undeclare()
 
 
-class Bus:
+class Bus(Closing):
     """What one process says and hears in one run.
 
     Threads may share it. Handlers run on a thread for each subscription or server; they must be
@@ -295,17 +295,6 @@ class Bus:
             undeclare()
         for responder in list(self._responders):
             responder.drop()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _require_open(self) -> None:
         if self._is_closed:

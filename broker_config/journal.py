@@ -16,9 +16,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from broker_config.closing import Closing
 from broker_config.database import (
     Schema,
     open_database,
@@ -64,7 +63,7 @@ class _Append:
     future: Future[tuple[Appended, ...]]
 
 
-class JournalReader:
+class JournalReader(Closing):
     """Reads a journal; a follower's or an offline tool's view of another process's file.
 
     Every thread that reads gets a connection of its own, so that readers wait for nobody.
@@ -157,17 +156,6 @@ class JournalReader:
             for connection in self._readers:
                 connection.close()
             self._readers.clear()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _reader(self) -> sqlite3.Connection:
         self._require_open()

@@ -11,15 +11,14 @@ import fcntl
 import os
 import socket
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
+from broker_config.closing import Closing
 from broker_config.errors import AlreadyOwned, StorageError
 
 RUN_LOCK = "owner.lock"
 
 
-class FileLock:
+class FileLock(Closing):
     """Holds a file exclusively from construction until `close`.
 
     The file stays after the release: deleting it would let two processes hold two files of one
@@ -65,17 +64,6 @@ class FileLock:
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def own_run(folder: Path) -> FileLock:

@@ -13,13 +13,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from broker_config.closing import Closing
 from broker_config.codec import SIZE_LIMITS, encode
 from broker_config.database import Schema, open_database, storage_errors, transaction
 from broker_config.errors import MessageError, SpoolFull, StorageError
@@ -73,7 +72,7 @@ class SpoolStatus:
     max_bytes: int
 
 
-class Spool:
+class Spool(Closing):
     """The spool of one actor; threads may share it.
 
     Sequence numbers go on across restarts and never repeat.
@@ -304,17 +303,6 @@ class Spool:
         with self._lock:
             self._connection.close()
             self._file_lock.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     @contextlib.contextmanager
     def _changing(self) -> Iterator[None]:
