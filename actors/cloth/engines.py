@@ -6,6 +6,8 @@ from typing import Any
 from actors.cloth.engine import ClothEngine
 from actors.cloth.pybullet_process import PyBulletProcessEngine
 from actors.cloth.pybullet_settings import PyBulletSettings
+from actors.cloth.xpbd_engine import XpbdEngine
+from actors.cloth.xpbd_settings import XpbdSettings
 
 Settings = Mapping[str, Any]
 
@@ -33,6 +35,11 @@ def _pybullet(settings: Settings) -> ClothEngine:
     return PyBulletProcessEngine(PyBulletSettings(**settings))
 
 
+def _xpbd(settings: Settings) -> ClothEngine:
+    _check_names("xpbd", settings, XpbdSettings.__dataclass_fields__)
+    return XpbdEngine(XpbdSettings(**settings))
+
+
 def _check_names(engine: str, settings: Settings, known: Mapping[str, object]) -> None:
     unknown = sorted(set(settings) - set(known))
     if unknown:
@@ -42,5 +49,5 @@ def _check_names(engine: str, settings: Settings, known: Mapping[str, object]) -
         )
 
 
-ENGINES: dict[str, Callable[[Settings], ClothEngine]] = {"pybullet": _pybullet}
+ENGINES: dict[str, Callable[[Settings], ClothEngine]] = {"pybullet": _pybullet, "xpbd": _xpbd}
 """Each engine's maker, from its settings."""

@@ -1,0 +1,112 @@
+"""What keeps a cloth's vertices apart and together: distances that follow from its mesh."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.meshes import ClothMesh
+from actors.cloth.xpbd_settings import XpbdSettings
+
+LONG_EDGE = 1.2
+"""Edges longer than this many spacings are diagonals: they resist shear, not stretch."""
+SHORT_DIAGONAL = 1.6
+"""Opposite vertices of two triangles at most this many spacings apart are the other diagonal."""
+STRAIGHT = 0.98
+"""Cosine of the angle between two edges that count as one line."""
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceConstraints:
+    """Pairs of vertices that want to be at their distance at rest, and pairs that never collide."""
+
+    pairs: NDArray[np.int32]
+    """i32[C, 2], in the order in which they are solved."""
+    rest_lengths_m: NDArray[np.float64]
+    """f64[C]."""
+    compliances: NDArray[np.float64]
+    """f64[C]."""
+    spacing_m: float
+    """Of the mesh: what its short edges measure."""
+    neighbours: NDArray[np.int32]
+    """i32[K], for each vertex in turn those that it does not collide with."""
+    first_neighbour: NDArray[np.int32]
+    """i32[V + 1], where in `neighbours` those of a vertex begin."""
+
+
+def distance_constraints(mesh: ClothMesh, settings: XpbdSettings) -> DistanceConstraints:
+    """Threads, diagonals and bending of a mesh, in a random but fixed order.
+
+    In the mesh's own order each sweep would push errors in one direction.
+    """
+    spacing_m = float(np.percentile(mesh.rest_edge_lengths_m, 20))
+    is_long = mesh.rest_edge_lengths_m > LONG_EDGE * spacing_m
+    diagonals = np.concatenate(
+        [mesh.edges[is_long], _other_diagonals(mesh, SHORT_DIAGONAL * spacing_m)]
+    )
+    kinds = [
+        (mesh.edges[~is_long], settings.stretch_compliance),
+        (diagonals, settings.shear_compliance),
+        (_two_apart_on_a_line(mesh), settings.bending_compliance),
+    ]
+    pairs = np.concatenate([ids for ids, _ in kinds]).astype(np.int32)
+    compliances = np.concatenate([np.full(len(ids), value) for ids, value in kinds])
+    order = np.random.default_rng(0).permutation(len(pairs))
+    pairs, compliances = np.ascontiguousarray(pairs[order]), compliances[order]
+    ends = mesh.vertices_m[pairs]
+    lengths_m = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
+    close_m = settings.thickness_cells * spacing_m * 1.05
+    neighbours, first = _never_colliding(mesh, close_m)
+    return DistanceConstraints(pairs, lengths_m, compliances, spacing_m, neighbours, first)
+
+
+def _other_diagonals(mesh: ClothMesh, longest_m: float) -> NDArray[np.int32]:
+    """Opposite vertices of two triangles with a common edge, where they are close, i32[K, 2]."""
+    opposite: dict[tuple[int, int], list[int]] = {}
+    for a, b, c in mesh.faces.tolist():
+        for one, two, third in ((a, b, c), (b, c, a), (c, a, b)):
+            opposite.setdefault((min(one, two), max(one, two)), []).append(third)
+    edges = set(map(tuple, mesh.edges.tolist()))
+    found = {(min(pair), max(pair)) for pair in opposite.values() if len(pair) == 2}
+    ids = np.array(sorted(found - edges), np.int32).reshape(-1, 2)
+    ends = mesh.vertices_m[ids]
+    is_short: NDArray[np.bool_] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) < longest_m
+    return np.asarray(ids[is_short])
+
+
+def _two_apart_on_a_line(mesh: ClothMesh) -> NDArray[np.int32]:
+    """Vertices joined by two edges that lie on one line, i32[K, 2]."""
+    around = _adjacent(mesh)
+    found = set()
+    for middle, ends in enumerate(around):
+        here = mesh.vertices_m[middle]
+        for left in ends:
+            for right in ends:
+                if left >= right or right in around[left]:
+                    continue
+                one, two = here - mesh.vertices_m[left], mesh.vertices_m[right] - here
+                if one @ two > STRAIGHT * np.linalg.norm(one) * np.linalg.norm(two):
+                    found.add((left, right))
+    return np.array(sorted(found), np.int32).reshape(-1, 2)
+
+
+def _adjacent(mesh: ClothMesh) -> list[set[int]]:
+    around: list[set[int]] = [set() for _ in mesh.vertices_m]
+    for a, b in mesh.edges.tolist():
+        around[a].add(b)
+        around[b].add(a)
+    return around
+
+
+def _never_colliding(
+    mesh: ClothMesh, close_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices that are joined by an edge, or closer at rest than layers may come."""
+    lists = []
+    for vertex, joined in enumerate(_adjacent(mesh)):
+        distances_m = np.linalg.norm(mesh.vertices_m - mesh.vertices_m[vertex], axis=1)
+        lists.append(sorted(joined | set(np.flatnonzero(distances_m < close_m).tolist())))
+    first = np.cumsum([0, *map(len, lists)])
+    assert all(a < b for a, b in pairwise(first))
+    return np.concatenate(lists).astype(np.int32), first.astype(np.int32)

@@ -1,0 +1,185 @@
+"""The fast engine: XPBD cloth that repeats itself bit by bit and returns to any saved state."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.engine import TABLE_HALF_WIDTH_M, ClothEngineError, checked_vertices
+from actors.cloth.gripper import GripperMotion, check_drop, check_grasp, gripper_path_in_world
+from actors.cloth.meshes import ClothMesh
+from actors.cloth.xpbd_constraints import distance_constraints
+from actors.cloth.xpbd_settings import XpbdSettings
+from actors.cloth.xpbd_solver import Body, Distances, Numbers, advance
+
+FRAME_SECS = 1 / 60
+"""How often it is looked whether the cloth has come to rest."""
+RESTING_FRAMES = 3
+"""So many slow frames in a row are rest: cloth that turns back is slow for one."""
+SKIN_THICKNESSES = 0.75
+ROOM_FOR_PAIRS = 64
+"""Close pairs for each vertex; a crumpled handkerchief has about ten."""
+
+_NOTHING = np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class XpbdState:
+    """All that the cloth's future depends on, besides its mesh and settings."""
+
+    mesh: ClothMesh
+    positions_m: NDArray[np.float64]
+    """f64[V, 3]."""
+    velocities_m_per_s: NDArray[np.float64]
+    """f64[V, 3]."""
+
+
+@dataclass
+class XpbdEngine:
+    """Cloth of vertices that keep their distances; one thread, no random numbers.
+
+    Equal calls give equal bits, in any process on any machine with the same CPU type.
+    """
+
+    settings: XpbdSettings = field(default_factory=XpbdSettings)
+    motion: GripperMotion = field(default_factory=GripperMotion)
+
+    def __post_init__(self) -> None:
+        """Begin without cloth."""
+        self._mesh: ClothMesh | None = None
+
+    @property
+    def mesh(self) -> ClothMesh:
+        """The cloth at rest.
+
+        Raises:
+            ClothEngineError: before the first reset.
+        """
+        if self._mesh is None:
+            raise ClothEngineError(
+                "XpbdEngine: expected reset() first; got no cloth; call reset(mesh)"
+            )
+        return self._mesh
+
+    def reset(self, mesh: ClothMesh, vertices_in_world: NDArray[np.float64] | None = None) -> None:
+        """Put a new piece of cloth on the table; see `ClothEngine.reset`."""
+        vertices = checked_vertices(mesh, vertices_in_world)
+        if self._mesh is not mesh:
+            self._prepare(mesh)
+        vertices[:, 2] += self._numbers.thickness_m / 2
+        self._place(vertices, np.zeros_like(vertices))
+        self._settle(least_secs=0.0)
+
+    def vertices_in_world(self) -> NDArray[np.float64]:
+        """Where the vertices are, f64[V, 3]: a copy; see `ClothEngine.vertices_in_world`."""
+        _ = self.mesh
+        return self._body.positions_m.copy()
+
+    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
+        """Carry vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
+        check_grasp(grasped, len(self.mesh.vertices_m))
+        check_drop(drop_xy_m)
+        start_m = self._body.positions_m[grasped]
+        path_m = gripper_path_in_world(
+            start_m[0], drop_xy_m, self.motion, self._numbers.substep_secs
+        )
+        self._body.inverse_masses[grasped] = 0.0
+        self._advance(len(path_m), grasped, path_m[:, None] + (start_m - start_m[0]))
+        self._body.inverse_masses[grasped] = 1.0
+        self._body.velocities_m_per_s[grasped] = 0.0  # fingers stop before they open
+        self._settle(self.motion.settle_secs)
+
+    def save(self) -> XpbdState:
+        """The whole state, independent of what the engine does next."""
+        mesh, body = self.mesh, self._body
+        return XpbdState(mesh, body.positions_m.copy(), body.velocities_m_per_s.copy())
+
+    def restore(self, state: XpbdState) -> None:
+        """Return to a state that `save` gave, also to that of another cloth."""
+        if self._mesh is not state.mesh:
+            self._prepare(state.mesh)
+        self._place(state.positions_m, state.velocities_m_per_s)
+
+    def close(self) -> None:
+        """Forget the cloth; may be called twice."""
+        self._mesh = None
+
+    def _prepare(self, mesh: ClothMesh) -> None:
+        settings = self.settings
+        constraints = distance_constraints(mesh, settings)
+        substep_secs = 1 / settings.substeps_per_sec
+        thickness_m = settings.thickness_cells * constraints.spacing_m
+        skin_m = SKIN_THICKNESSES * thickness_m
+        cell_m = thickness_m + skin_m
+        self._distances = Distances(
+            constraints.pairs,
+            constraints.rest_lengths_m,
+            constraints.compliances / substep_secs**2,
+            constraints.neighbours,
+            constraints.first_neighbour,
+        )
+        self._numbers = Numbers(
+            substep_secs,
+            thickness_m,
+            settings.table_friction,
+            settings.layer_friction,
+            settings.damping_per_sec,
+            settings.fastest_m_per_s,
+            -TABLE_HALF_WIDTH_M,
+            cell_m,
+            skin_m,
+        )
+        self._body = _new_body(len(mesh.vertices_m), int(2 * TABLE_HALF_WIDTH_M / cell_m) + 1)
+        self._mesh = mesh
+
+    def _place(
+        self, positions_m: NDArray[np.float64], velocities_m_per_s: NDArray[np.float64]
+    ) -> None:
+        body = self._body
+        body.positions_m[:] = positions_m
+        body.velocities_m_per_s[:] = velocities_m_per_s
+        body.inverse_masses[:] = 1.0
+        body.n_close_pairs[0] = -1
+
+    def _settle(self, least_secs: float) -> None:
+        """Waits until the cloth lies still, at least and at most for a time."""
+        substeps = round(FRAME_SECS * self.settings.substeps_per_sec)
+        least, most = least_secs / FRAME_SECS, self.settings.longest_settling_secs / FRAME_SECS
+        frames = resting = 0
+        while frames < least or (resting < RESTING_FRAMES and frames < most):
+            speed = self._advance(substeps, _NOTHING, np.zeros((substeps, 0, 3)))
+            frames += 1
+            resting = resting + 1 if speed < self.settings.rest_speed_m_per_s else 0
+        # What is left is creep; the next action then begins from the picture alone.
+        self._body.velocities_m_per_s[:] = 0.0
+        self._body.n_close_pairs[0] = -1
+
+    def _advance(
+        self, n_substeps: int, grasped: NDArray[np.int64], path_m: NDArray[np.float64]
+    ) -> float:
+        speed = advance(
+            self._body,
+            self._distances,
+            self._numbers,
+            grasped,
+            np.ascontiguousarray(path_m),
+            n_substeps,
+        )
+        if speed == np.inf:
+            self._body.positions_m[:] = np.nan  # the guard sees a cloth that is no cloth any more
+            return 0.0
+        return float(speed)
+
+
+def _new_body(n_vertices: int, n_cells: int) -> Body:
+    return Body(
+        positions_m=np.zeros((n_vertices, 3)),
+        velocities_m_per_s=np.zeros((n_vertices, 3)),
+        inverse_masses=np.ones(n_vertices),
+        previous_m=np.zeros((n_vertices, 3)),
+        listed_at_m=np.zeros((n_vertices, 3)),
+        close_pairs=np.zeros((ROOM_FOR_PAIRS * n_vertices, 2), np.int32),
+        n_close_pairs=np.full(1, -1),
+        first_in_cell=np.zeros((n_cells, n_cells), np.int32),
+        next_in_cell=np.zeros(n_vertices, np.int32),
+    )
