@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -105,9 +105,15 @@ def collect(
     policy: ActingPolicy,
     ticket: Ticket,
     id_: TrajectoryId,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Trajectory:
-    """Plays a whole episode."""
-    parts = list(rollout(env, policy, ticket))
-    start, steps = parts[0], [part for part in parts[1:] if isinstance(part, Step)]
+    """Plays a whole episode; whatever `on_step` raises after a step ends it."""
+    events = rollout(env, policy, ticket)
+    start = next(events)
     assert isinstance(start, Start)
+    steps: list[Step] = []
+    for step in events:
+        assert isinstance(step, Step)
+        steps.append(step)
+        on_step()
     return to_trajectory(id_, ticket, start, steps)

@@ -21,24 +21,22 @@ from actors.rollout import (
     to_trajectory,
 )
 from actors.task import make_task_env
+from actors.views import Views
 from broker_config.bus import Bus
-from broker_config.codec import SCHEMA_VERSION
-from broker_config.errors import AttachRefused, OwnerUnreachable, Refused, SpoolFull
+from broker_config.errors import OwnerUnreachable, Refused, SpoolFull
 from broker_config.failpoints import Failpoint, reach
 from broker_config.heart import Heart, Pulse
+from broker_config.joining import attach
 from broker_config.messages import (
-    Attach,
     Instruction,
     Snapshot,
     SnapshotRequest,
     Ticket,
     TicketReply,
     TicketRequest,
-    Welcome,
 )
 from broker_config.preset import Preset, preset_from_json
 from broker_config.spool import Spool
-from broker_config.version import VERSION
 
 _log = logging.getLogger(__name__)
 
@@ -49,9 +47,6 @@ TICKET_TIMEOUT_SECS = 4.0
 """Longer than the owner's long poll."""
 
 RETRY_SECS = 0.5
-
-ATTACH_PATIENCE_SECS = 3.0
-"""A refusal is asked again for so long: a killed process of the same name may still seem alive."""
 
 FLUSH_AT_STOP_SECS = 5.0
 FLUSH_AT_END_SECS = 60.0
@@ -98,6 +93,7 @@ class Actor:
         self._wrap_env = wrap_env
         self._keys = bus.keys
         self._incarnation = incarnation
+        self._views = Views(bus, name, incarnation)
         self._stop = threading.Event()
         self._pulse = Pulse()
         self._owner_epoch = 0
@@ -109,8 +105,11 @@ class Actor:
         """Asks the actor to leave at the next step; safe in a signal handler."""
         self._stop.set()
 
-    def run(self) -> None:
+    def run(self) -> bool:
         """Acts until the owner says that it is over, or `stop`.
+
+        Returns:
+            Whether the owner said so and has what it shall have; False after `stop`.
 
         Raises:
             AttachRefused: The owner's versions or preset differ.
@@ -119,9 +118,10 @@ class Actor:
         try:
             preset = self._attach()
         except StopRequested:
-            return
+            return False
         if recovered := self._spool.recover():
             _log.info("Recovered the %d finished steps of %s", recovered.steps, recovered.id)
+            reach(Failpoint.SPOOL_RECOVERED)
         env = self._wrap_env(make_task_env(preset.task))
         heart = Heart(
             self._bus,
@@ -137,15 +137,16 @@ class Actor:
                 heart,
                 Delivery(self._bus, self._spool, key, lambda: self._owner_epoch) as delivery,
             ):
-                delivery.flush(lambda: not self._stop.is_set())
+                delivery.flush(self._beating(lambda: not self._stop.is_set()))
                 try:
-                    self._act(env, preset, delivery)
+                    return self._act(env, preset, delivery)
                 except StopRequested:
-                    delivery.flush(wait_until(time.monotonic() + FLUSH_AT_STOP_SECS))
+                    self._flush_for(FLUSH_AT_STOP_SECS, delivery)
+                    return False
         finally:
             env.close()
 
-    def _act(self, env: ClothbusEnv, preset: Preset, delivery: Delivery) -> None:
+    def _act(self, env: ClothbusEnv, preset: Preset, delivery: Delivery) -> bool:
         policies = self._bus.latest_reader(self._keys.policy, Snapshot)
         unplayable: Ticket | None = None
         while True:
@@ -157,8 +158,7 @@ class Actor:
                 self._attach()
                 self._policy = None
             if reply.instruction in (Instruction.STOP, Instruction.DRAIN):
-                self._leave(delivery, reply.instruction)
-                return
+                return self._leave(delivery, reply.instruction)
             if reply.ticket is not None:
                 reach(Failpoint.TICKET_RECEIVED)
                 try:
@@ -170,39 +170,39 @@ class Actor:
                 self.state = "collecting"
                 self._play(env, policy, reply.ticket)
 
-    def _leave(self, delivery: Delivery, instruction: Instruction) -> None:
-        if delivery.flush(wait_until(time.monotonic() + FLUSH_AT_END_SECS)):
+    def _leave(self, delivery: Delivery, instruction: Instruction) -> bool:
+        """Delivers; returns whether there is no reason to come back."""
+        self.state = "leaving"
+        if self._flush_for(FLUSH_AT_END_SECS, delivery):
             _log.info("Leaving: %s", instruction.value)
-        else:
-            waiting = self._spool.status().trajectories
-            _log.warning("Leaving with %d trajectories in the spool, for the next start", waiting)
+            return True
+        waiting = self._spool.status().trajectories
+        _log.warning("Leaving with %d trajectories in the spool, for the next start", waiting)
+        return instruction is Instruction.STOP
+
+    def _flush_for(self, timeout_secs: float, delivery: Delivery) -> bool:
+        return delivery.flush(self._beating(wait_until(time.monotonic() + timeout_secs)))
+
+    def _beating(self, keep_waiting: Callable[[], bool]) -> Callable[[], bool]:
+        """Waiting for the owner is no standstill."""
+
+        def beat_and_ask() -> bool:
+            self._pulse.beat()
+            return keep_waiting()
+
+        return beat_and_ask
 
     # Joining ----------------------------------------------------------------------------------
 
     def _attach(self) -> Preset:
-        request = Attach(
-            role="actor",
-            id=self._name,
-            incarnation=self._incarnation,
-            schema_version=SCHEMA_VERSION,
-            software_version=VERSION,
-            preset_digest=self._preset.digest if self._preset else "",
+        welcome = self._insist(
+            lambda: attach(
+                self._bus, "actor", self._name, self._incarnation, self._preset, self._stop.wait
+            )
         )
-        key = self._keys.attach("actor", self._name)
-        welcome = self._insist(lambda: self._ask_to_attach(key, request))
         self._owner_epoch = welcome.owner_epoch
         self._preset = preset_from_json(welcome.preset_json)
         return self._preset
-
-    def _ask_to_attach(self, key: str, request: Attach) -> Welcome:
-        give_up_secs = time.monotonic() + ATTACH_PATIENCE_SECS
-        while True:
-            try:
-                return self._bus.ask(key, request, Welcome, timeout_secs=ASK_TIMEOUT_SECS)
-            except Refused as error:
-                if time.monotonic() > give_up_secs:
-                    raise AttachRefused(f"run {self._keys.run}: {error}") from error
-                self._stop.wait(RETRY_SECS)
 
     def _next_ticket(self, unplayable: Ticket | None) -> TicketReply:
         # One nonce for one question, however often it has to be asked: an answer that came too
@@ -258,6 +258,7 @@ class Actor:
         assert isinstance(start, Start)
         if self._spool_steps:
             self._when_there_is_room(lambda: self._spool.begin(id_, ticket, start.observation))
+        self._views.show_start(ticket, start.observation)
         steps: list[Step] = []
         for step in events:
             assert isinstance(step, Step)
@@ -274,6 +275,7 @@ class Actor:
                 )
             # Only now: what was done is recorded before anything else happens.
             is_over = step.terminated or step.truncated or len(steps) == ticket.steps
+            self._views.show_step(ticket, len(steps), step, is_last=is_over)
             if self._stop.is_set() and not is_over:
                 raise StopRequested
         reach(Failpoint.EPISODE_PLAYED)
@@ -285,8 +287,11 @@ class Actor:
         reach(Failpoint.EPISODE_SPOOLED)
 
     def _when_there_is_room(self, add: Callable[[], None]) -> None:
-        """Adds to the spool; while it is full, waits for the owner to take something from it."""
-        while not self._stop.is_set():
+        """Adds to the spool; while it is full, waits for the owner to take something from it.
+
+        It is tried at least once: what is finished when the actor is stopped shall not be lost.
+        """
+        while True:
             self._pulse.beat()
             try:
                 return add()
@@ -294,8 +299,8 @@ class Actor:
                 if self.state != "spool full":
                     _log.warning("Waiting: %s", error)
                 self.state = "spool full"
-                self._stop.wait(RETRY_SECS)
-        raise StopRequested
+                if self._stop.wait(RETRY_SECS):
+                    raise StopRequested from error
 
     def _numbers(self) -> Mapping[str, float]:
         return {"policy_version": self._version, "spooled": self._spool.status().trajectories}

@@ -216,14 +216,22 @@ class Bus(Closing):
         return self._own_publisher(key, row, publisher)
 
     def subscribe(
-        self, pattern: str, message_type: type[M], handler: Callable[[ParsedKey, M], None]
+        self,
+        pattern: str,
+        message_type: type[M],
+        handler: Callable[[ParsedKey, M], None],
+        most_waiting: int = _WAITING_MESSAGES,
     ) -> None:
         """Hands best-effort messages to `handler` until the bus is closed.
 
-        When the handler is slower than the messages come, the oldest are dropped.
+        Args:
+            pattern: A key, or `keys.every(...)`.
+            message_type: What is published there.
+            handler: Gets key and message.
+            most_waiting: When more than this wait for the handler, the oldest are dropped.
         """
         subscriber = self._session.declare_subscriber(
-            pattern, zenoh.handlers.RingChannel(_WAITING_MESSAGES)
+            pattern, zenoh.handlers.RingChannel(most_waiting)
         )
         self._pump_samples(pattern, subscriber, subscriber.handler, message_type, handler)
 

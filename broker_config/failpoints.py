@@ -26,6 +26,7 @@ class Failpoint(StrEnum):
     """Each is named for what has just been done."""
 
     # The actor
+    SPOOL_RECOVERED = "spool-recovered"
     TICKET_RECEIVED = "ticket-received"
     EPISODE_PLAYED = "episode-played"
     EPISODE_SPOOLED = "episode-spooled"

@@ -88,7 +88,7 @@ class Heart:
                     pid,
                     state,
                     self._pulse.stalled_secs,
-                    dict(numbers),
+                    {**numbers, "rejected": self._bus.rejected.total},
                 )
                 self._publisher.put(beat)
             except ClothbusError as error:

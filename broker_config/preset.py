@@ -137,6 +137,15 @@ class SchedulePreset:
         """The policy version on which episode `ticket` acts; version v exists after v updates."""
         return max(0, self.updates_before(ticket) - self.policy_lag)
 
+    def episodes_before(self, version: int) -> int:
+        """Episodes that policy `version` has learned from; the inverse of `updates_before`."""
+        return version if self.update_every == "episode" else version * self.episodes_per_iteration
+
+    def iteration_versions(self) -> tuple[int, ...]:
+        """The untrained policy and the last one of each iteration: these are kept and evaluated."""
+        ends = range(0, self.episodes + 1, self.episodes_per_iteration)
+        return tuple(self.updates_before(end) for end in ends)
+
     def updates_after(self, ticket: int) -> bool:
         """Whether the network is updated once episode `ticket` is in the memory."""
         return self.updates_before(ticket + 1) > self.updates_before(ticket)

@@ -89,10 +89,15 @@ class Responder:
     """The duty to answer one question, from any thread, now or later.
 
     Dropped without an answer, it tells the asker at once that there is none.
+
+    Attributes:
+        question: The encoded request, as it was sent.
     """
 
     def __init__(self, query: zenoh.Query, row: Row) -> None:
         self._key = str(query.key_expr)
+        payload = query.payload
+        self.question = b"" if payload is None else payload.to_bytes()
         self._query: zenoh.Query | None = query
         self._row = row
         self._lock = threading.Lock()
@@ -172,8 +177,7 @@ def serve_one(
     responder = Responder(query, row_of(key.kind))
     remember(responder)
     try:
-        payload = query.payload
-        request = decode(b"" if payload is None else payload.to_bytes(), request_type)
+        request = decode(responder.question, request_type)
         check_sender(key, request)
         handler(key, request, responder)
     except MessageError as error:

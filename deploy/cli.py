@@ -11,16 +11,20 @@ from rich.console import Console
 from rich.table import Table
 
 from broker_config.errors import ClothbusError, PresetError, RouterUnreachable
+from broker_config.heart import HUNG_SECS
 from broker_config.messages import Command
 from broker_config.preset import Preset
 from broker_config.session import DEFAULT_ADDRESS
+from deploy.priority import Priority
 from deploy.process import (
     CONFIGURATION_EXIT,
-    INTERRUPTED_EXIT,
     UNREACHABLE_EXIT,
     end_with_supervisor,
     log_to_stderr,
+    unfinished_exit,
 )
+
+SHORTEST_HUNG_SECS = 10.0
 
 # What a command needs beyond this is imported when it runs: `clothbus status` shall not wait for
 # torch and a physics engine.
@@ -43,6 +47,10 @@ def run(
     demonstrations: Path | None = None,
     connect: str | None = None,
     step_log: Path | None = None,
+    evaluate: int = 0,
+    evaluator_priority: Priority = "idle",
+    hung_secs: float = HUNG_SECS,
+    record: bool = True,
     zenoh: tuple[str, ...] = (),
 ) -> None:
     """Train a preset: router, learner and actors on this machine, with live progress.
@@ -58,6 +66,11 @@ def run(
         demonstrations: Folder of `clothbus collect`, for presets with an initialisation.
         connect: Address of a router that runs already; without it one is started.
         step_log: File for one line per step on the environment's side.
+        evaluate: Have an evaluator score each iteration's policy over so many episodes meanwhile;
+            0 for none.
+        evaluator_priority: `idle` has what processor time is left over; `normal`, a share.
+        hung_secs: A process that gets nowhere for so long is killed and started again.
+        record: Record the run as MCAP into its folder; a run in one process is not recorded.
         zenoh: Zenoh settings, each key/path=value.
     """
     from deploy.presets import load_preset
@@ -65,6 +78,8 @@ def run(
     from deploy.run_folder import RunFolder, create_run_folder
 
     _require_positive("actors", actors)
+    _require_patience(hung_secs)
+    _require_evaluable(evaluate, in_process)
     if (preset is None) == (resume is None):
         raise PresetError("run: expected a PRESET or --resume FOLDER; give exactly one of them")
     if resume is not None:
@@ -74,10 +89,21 @@ def run(
         chosen = load_preset(str(preset), settings)
         _refuse_unsupported(chosen)
         folder = create_run_folder(runs, chosen)
-    options = RunOptions(actors, device, connect, demonstrations, step_log, zenoh)
+    options = RunOptions(
+        actors=actors,
+        device=device,
+        address=connect,
+        demonstrations=demonstrations,
+        step_log=step_log,
+        evaluate=evaluate,
+        evaluator_priority=evaluator_priority,
+        hung_secs=hung_secs,
+        overrides=zenoh,
+        record=record,
+    )
     carry_out = run_in_process if in_process else run_over_bus
     if not carry_out(folder, chosen, options, Console()):
-        sys.exit(INTERRUPTED_EXIT)
+        sys.exit(unfinished_exit())
 
 
 def _refuse_unsupported(preset: Preset) -> None:
@@ -134,6 +160,7 @@ def learner(
     connect: str = DEFAULT_ADDRESS,
     device: str = "cpu",
     demonstrations: Path | None = None,
+    hung_secs: float = HUNG_SECS,
     zenoh: tuple[str, ...] = (),
 ) -> None:
     """Learn, and own the run's journal; an existing run folder is resumed.
@@ -145,19 +172,22 @@ def learner(
         connect: Address of the router.
         device: Where to compute: cpu, cuda.
         demonstrations: Folder of `clothbus collect`.
+        hung_secs: An actor that gets nowhere for so long loses its ticket to another one.
         zenoh: Zenoh settings, each key/path=value.
     """
     from deploy.presets import load_preset
     from deploy.roles import run_learner
     from deploy.run_folder import RunFolder, prepare_run_folder
 
+    _require_patience(hung_secs)
     if preset is None:
         run_folder = RunFolder(folder)
     else:
         chosen = load_preset(preset, settings)
         _refuse_unsupported(chosen)
         run_folder = prepare_run_folder(folder, chosen)
-    run_learner(run_folder, run_folder.read_preset(), connect, device, demonstrations, zenoh)
+    chosen = run_folder.read_preset()
+    run_learner(run_folder, chosen, connect, device, demonstrations, hung_secs, zenoh)
 
 
 @app.command(name="actor")
@@ -198,6 +228,28 @@ def actor(
         step_log,
         zenoh,
     )
+
+
+@app.command(name="record")
+def record(
+    output: Path,
+    id: str = "recorder",  # noqa: A002 - the option's name
+    connect: str = DEFAULT_ADDRESS,
+    run: str | None = None,
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Record a run as MCAP: its whole journal and policies, and what is seen of its live traffic.
+
+    Args:
+        output: Folder of the recording; one that is there already is gone on with.
+        id: This recorder's name; every recorder of a run has its own.
+        connect: Address of the router, or a run folder that `clothbus run` made.
+        run: The run's name; not needed when the router carries one run.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.roles import run_recorder
+
+    run_recorder(_address(connect), id, output, run, zenoh)
 
 
 @app.command(name="status")
@@ -276,6 +328,35 @@ def evaluate(
     Console().print(score_table(scores))
 
 
+@app.command(name="evaluator")
+def evaluator(
+    output: Path,
+    connect: str = DEFAULT_ADDRESS,
+    run: str | None = None,
+    episodes: int = 20,
+    id: str = "evaluator",  # noqa: A002 - the option's name
+    priority: Priority = "idle",
+    zenoh: tuple[str, ...] = (),
+) -> None:
+    """Score the policies of a run while it goes on.
+
+    Args:
+        output: Where results, policies and TensorBoard logs go: the run's own folder on the
+            learner's machine, or any other, which is made like it.
+        connect: Address of the router, or a run folder that `clothbus run` made.
+        run: The run's name; not needed when the router carries one run.
+        episodes: For each policy version and mode.
+        id: This evaluator's name.
+        priority: `idle` has what processor time is left over; `normal`, a share.
+        zenoh: Zenoh settings, each key/path=value.
+    """
+    from deploy.roles import run_evaluator
+    from deploy.run_folder import RunFolder
+
+    _require_positive("episodes", episodes)
+    run_evaluator(_address(connect), id, RunFolder(output), episodes, run, priority, zenoh)
+
+
 @app.command(name="collect")
 def collect(
     preset: Annotated[str, tyro.conf.Positional],
@@ -311,9 +392,25 @@ def collect(
         )
 
 
+def _require_evaluable(episodes: int, in_process: bool) -> None:
+    if episodes < 0 or (episodes and in_process):
+        raise PresetError(
+            f"--evaluate: expected 0 or more, and 0 with --in-process; got {episodes}; "
+            "use `clothbus evaluate` after a run in one process"
+        )
+
+
 def _require_positive(option: str, value: int) -> None:
     if value < 1:
         raise PresetError(f"--{option}: expected at least 1; got {value}")
+
+
+def _require_patience(hung_secs: float) -> None:
+    if not hung_secs >= SHORTEST_HUNG_SECS:
+        raise PresetError(
+            f"--hung-secs: expected at least {SHORTEST_HUNG_SECS:g}; got {hung_secs:g}; in a "
+            "shorter time a busy machine stands still by itself"
+        )
 
 
 def _address(connect: str) -> str:
@@ -339,7 +436,7 @@ def main() -> None:
         is_unreachable = isinstance(error, RouterUnreachable)
         sys.exit(UNREACHABLE_EXIT if is_unreachable else CONFIGURATION_EXIT)
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED_EXIT)
+        sys.exit(unfinished_exit())
 
 
 if __name__ == "__main__":

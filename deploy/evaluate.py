@@ -1,68 +1,25 @@
-"""Scores policy snapshots of a run on seeds of their own, with bootstrap intervals."""
+"""`clothbus evaluate`: scores policy snapshots of a run folder on seeds of their own."""
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from contextlib import closing
+from itertools import starmap
 from pathlib import Path
-from typing import Literal
 
-import numpy as np
 from rich.table import Table
 
-from actors.acting import Greedy, Sampled
-from actors.envs import ClothbusEnv
 from actors.policy import Policy
-from actors.rollout import ActingPolicy, collect
-from actors.task import make_task_env
 from broker_config.errors import PresetError, StorageError
-from broker_config.messages import Ticket, TrajectoryId
 from broker_config.preset import Preset
-from broker_config.structure import from_plain, to_plain
+from deploy.evaluation import Episode, Mode, Player, Results, Score, modes_of, score_of
 from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore
-from learner.tickets import derive_seed
-
-Mode = Literal["sampled", "greedy"]
-
-EVALUATION_STREAM = 2**31
-"""Keeps the seeds of evaluation apart from those of every ticket of the run."""
-
-BOOTSTRAP_SAMPLES = 10_000
-GUARDED_ATTEMPTS = 20
-
-
-@dataclass(frozen=True)
-class Episode:
-    """The result of one evaluation episode."""
-
-    version: int
-    mode: Mode
-    number: int
-    """Names the episode's seed."""
-    return_: float
-    success: bool
-
-
-@dataclass(frozen=True)
-class Score:
-    """What a policy version achieved."""
-
-    version: int
-    mode: Mode
-    episodes: int
-    mean_return: float
-    return_interval: tuple[float, float]
-    """Bootstrap, 95 %."""
-    success_rate: float
-    success_interval: tuple[float, float]
-    returns: tuple[float, ...]
 
 
 def evaluate(
@@ -81,71 +38,51 @@ def evaluate(
         jobs: Processes.
 
     Raises:
+        AlreadyOwned: Another process evaluates the run.
         PresetError: The mode has no meaning for the method.
         StorageError: A version is not retained, or the file holds something else.
     """
     preset = folder.read_preset()
-    if mode == "sampled" and preset.algorithm.method == "dqn":
+    if mode not in modes_of(preset.algorithm):
         raise PresetError(
-            f"{preset.name}: expected mode greedy; got sampled; Q has no softmax policy"
+            f"{preset.name}: expected mode greedy; got {mode}; Q has no softmax policy"
         )
     chosen = versions or _first_and_last(folder)
-    played = {(it.version, it.mode, it.number): it for it in _read(folder.evaluation)}
-    missing = [
-        (version, number)
-        for version in chosen
-        for number in range(episodes)
-        if (version, mode, number) not in played
-    ]
-    with (
-        folder.evaluation.open("a") as results,
-        ProcessPoolExecutor(
-            jobs,
-            multiprocessing.get_context("spawn"),
-            _prepare,
-            (os.getpid(), folder.path, preset, mode),
-        ) as pool,
-    ):
+    with Results(folder.evaluation) as results:
+        missing = [
+            (version, number)
+            for version in chosen
+            for number in range(episodes)
+            if (version, mode, number) not in results.episodes
+        ]
+        for episode in _played(folder, preset, mode, missing, jobs):
+            results.add(episode)
+        return [
+            score_of([results.episodes[version, mode, n] for n in range(episodes)], preset.seed)
+            for version in chosen
+        ]
+
+
+def _played(
+    folder: RunFolder, preset: Preset, mode: Mode, missing: Sequence[tuple[int, int]], jobs: int
+) -> Iterator[Episode]:
+    if jobs == 1 or not missing:
+        with closing(_Worker(folder.path, preset, mode)) as worker:
+            yield from starmap(worker.play, missing)
+        return
+    with ProcessPoolExecutor(
+        jobs,
+        multiprocessing.get_context("spawn"),
+        _prepare,
+        (os.getpid(), folder.path, preset, mode),
+    ) as pool:
         try:
-            for episode in pool.map(_play, missing):
-                results.write(json.dumps(to_plain(episode)) + "\n")
-                results.flush()
-                played[episode.version, mode, episode.number] = episode
+            yield from pool.map(_play, missing)
         except BrokenProcessPool as error:
             raise StorageError(
                 "evaluation: expected workers that live; got one that died, its last words are "
                 "above; what was played is kept, evaluate again"
             ) from error
-    return [
-        _score([played[version, mode, number] for number in range(episodes)], preset.seed)
-        for version in chosen
-    ]
-
-
-def _read(path: Path) -> list[Episode]:
-    if not path.exists():
-        return []
-    whole, _, torn = path.read_text().rpartition("\n")
-    if torn:  # its process died while writing it
-        path.write_text(whole + "\n" if whole else "")
-    try:
-        return [from_plain(json.loads(line), Episode, path.name) for line in whole.splitlines()]
-    except ValueError as error:
-        raise StorageError(
-            f"{path}: expected evaluation episodes; got {error}; move the file away"
-        ) from error
-
-
-def bootstrap_interval(
-    values: Sequence[float], seed: int, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean."""
-    generator = np.random.default_rng([seed, EVALUATION_STREAM])
-    array = np.asarray(values, float)
-    picks = generator.integers(len(array), size=(BOOTSTRAP_SAMPLES, len(array)))
-    tail = (1 - confidence) / 2
-    low, high = np.quantile(array[picks].mean(axis=1), [tail, 1 - tail])
-    return float(low), float(high)
 
 
 def _first_and_last(folder: RunFolder) -> list[int]:
@@ -153,21 +90,6 @@ def _first_and_last(folder: RunFolder) -> list[int]:
     if len(versions) < 2:
         raise StorageError(f"{folder.snapshots}: expected two policy versions; got {versions}")
     return [versions[0], versions[-1]]
-
-
-def _score(episodes: Sequence[Episode], seed: int) -> Score:
-    returns = tuple(episode.return_ for episode in episodes)
-    successes = [float(episode.success) for episode in episodes]
-    return Score(
-        episodes[0].version,
-        episodes[0].mode,
-        len(episodes),
-        float(np.mean(returns)),
-        bootstrap_interval(returns, seed),
-        float(np.mean(successes)),
-        bootstrap_interval(successes, seed),
-        returns,
-    )
 
 
 def score_table(scores: Sequence[Score]) -> Table:
@@ -188,44 +110,35 @@ def score_table(scores: Sequence[Score]) -> Table:
     return table
 
 
-# In the worker processes ----------------------------------------------------------------------
+# In the worker processes, or in this one ------------------------------------------------------
 
 
 class _Worker:
-    """One process's environment and policies."""
+    """A player and the policies that it has met."""
 
     def __init__(self, folder: Path, preset: Preset, mode: Mode) -> None:
         use_one_torch_thread()
         self._preset = preset
         self._mode = mode
         self._snapshots = SnapshotStore(RunFolder(folder).snapshots)
-        self._env: ClothbusEnv = make_task_env(preset.task)
-        self._policies: dict[int, ActingPolicy] = {}
+        self._player = Player(preset)
+        self._policies: dict[int, Policy] = {}
 
-    def play(self, version: int, episode: int) -> Episode:
-        """Plays an episode; one that the guard ends is played again on another seed."""
-        policy = self._policy(version)
-        for attempt in range(GUARDED_ATTEMPTS):
-            seed = derive_seed(self._preset.seed, EVALUATION_STREAM + episode, attempt, 0)
-            ticket = Ticket(episode, attempt, 0, seed, version, self._preset.task.horizon, 0.0)
-            id_ = TrajectoryId("evaluation", "evaluation", episode)
-            trajectory = collect(self._env, policy, ticket, id_)
-            if trajectory.guard is None:
-                score = trajectory.return_, trajectory.success
-                return Episode(version, self._mode, episode, *score)
-        raise StorageError(
-            f"evaluation episode {episode}: expected a sound attempt with one of "
-            f"{GUARDED_ATTEMPTS} seeds; got {trajectory.guard}; mend the task or the simulator"
-        )
+    def play(self, version: int, number: int) -> Episode:
+        """Plays an episode of a version that the folder retains."""
+        return self._player.play(self._policy(version), version, self._mode, number)
 
-    def _policy(self, version: int) -> ActingPolicy:
+    def close(self) -> None:
+        """Ends the environment."""
+        self._player.close()
+
+    def _policy(self, version: int) -> Policy:
         if version not in self._policies:
             weights = self._snapshots.get(version)
             if weights is None:
                 retained = ", ".join(map(str, self._snapshots.versions()))
                 raise StorageError(f"policy version: expected one of {retained}; got {version}")
-            policy = Policy.from_bytes(self._preset.network, weights)
-            self._policies[version] = Greedy(policy) if self._mode == "greedy" else Sampled(policy)
+            self._policies[version] = Policy.from_bytes(self._preset.network, weights)
         return self._policies[version]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
@@ -14,8 +15,26 @@ from broker_config.messages import Trajectory
 
 mpl.use("Agg")  # before pyplot: there is no screen
 from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
 
 STRIP_COLUMNS = 8
+
+SCORE_COLORS = ("C3", "C1")
+"""Of the evaluated policies, by mode."""
+
+
+@dataclass(frozen=True)
+class ScoredPolicies:
+    """What evaluation says of a run's policies in one mode, for the learning curve."""
+
+    mode: str
+    episodes: Sequence[int]
+    """That each policy had learned from."""
+    returns: Sequence[float]
+    """Means."""
+    return_intervals: Sequence[tuple[float, float]]
+    success_rates: Sequence[float]
+    success_intervals: Sequence[tuple[float, float]]
 
 
 def draw_learning_curve(
@@ -25,6 +44,7 @@ def draw_learning_curve(
     successes: Sequence[bool],
     samples_per_episode: int,
     episodes_per_iteration: int,
+    scored: Sequence[ScoredPolicies] = (),
 ) -> None:
     """Draws the return of each episode, each iteration's mean and its success rate as a PNG.
 
@@ -35,6 +55,7 @@ def draw_learning_curve(
         successes: Of each episode.
         samples_per_episode: T, for the horizontal axis.
         episodes_per_iteration: M.
+        scored: Evaluated policies, drawn with their intervals.
     """
     samples = np.arange(1, len(returns) + 1) * samples_per_episode
     figure, (upper, lower) = plt.subplots(
@@ -43,13 +64,33 @@ def draw_learning_curve(
     upper.plot(samples, returns, ".", color="0.6", label="episode")
     ends, means = _iteration_means(np.asarray(returns), episodes_per_iteration)
     upper.plot(ends * samples_per_episode, means, "o-", color="C0", label="mean of the iteration")
-    upper.set(ylabel="return", title=title)
-    upper.legend(loc="lower right")
     _, rates = _iteration_means(np.asarray(successes, float), episodes_per_iteration)
     lower.plot(ends * samples_per_episode, rates, "o-", color="C2")
+    for color, policies in zip(SCORE_COLORS, scored, strict=False):
+        at = np.asarray(policies.episodes) * samples_per_episode
+        label = f"evaluated, {policies.mode}, 95 %"
+        _draw_means(upper, at, policies.returns, policies.return_intervals, color, label)
+        _draw_means(lower, at, policies.success_rates, policies.success_intervals, color, label)
+    upper.set(ylabel="return", title=title)
+    upper.legend(loc="best")
     lower.set(xlabel="samples", ylabel="success rate", ylim=(-0.05, 1.05))
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _draw_means(
+    axis: Axes,
+    at: NDArray[np.int64],
+    means: Sequence[float],
+    intervals: Sequence[tuple[float, float]],
+    color: str,
+    label: str,
+) -> None:
+    if not means:
+        return
+    lows, highs = np.transpose(intervals)
+    arms = np.maximum(0.0, [np.asarray(means) - lows, highs - np.asarray(means)])
+    axis.errorbar(at, means, arms, fmt="s", color=color, capsize=3, label=label)
 
 
 def _iteration_means(

@@ -7,8 +7,16 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Mapping
 from types import FrameType
+from typing import TypeVar
+
+from broker_config.errors import AlreadyOwned
+
+_log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 PARENT_VARIABLE = "CLOTHBUS_PARENT_PID"
 """Set by a supervisor: the process ends when this parent does, however the parent ends."""
@@ -22,7 +30,17 @@ UNREACHABLE_EXIT = 4
 INTERRUPTED_EXIT = 130
 """Exit code after Ctrl-C, as shells have it."""
 
+TERMINATED_EXIT = 143
+"""Exit code after SIGTERM before the work was finished: 0 means finished or drained."""
+
+HELD_SECS = 15.0
+"""A process whose supervisor was killed lets go of its files in this time."""
+
+_POLL_SECS = 0.1
 _PR_SET_PDEATHSIG = 1
+
+_asked_by = signal.SIGINT
+"""The signal that asked this process to leave."""
 
 
 def child_environment() -> Mapping[str, str]:
@@ -46,10 +64,33 @@ def end_with_parent(parent_pid: int) -> None:
         sys.exit(f"clothbus: parent process {parent_pid} is gone")
 
 
-def on_terminate(handler: Callable[[], None]) -> None:
-    """Calls `handler` in the main thread on SIGTERM and SIGINT."""
+def take_when_free(take: Callable[[], T]) -> T:
+    """Takes something that only one process may have.
 
-    def handle(_: int, __: FrameType | None) -> None:
+    Whoever has a supervisor waits for a while: the supervisor may have come right after one that
+    was killed, whose processes are still on their way out.
+
+    Raises:
+        AlreadyOwned: Another process has it, and keeps it.
+    """
+    is_supervised = PARENT_VARIABLE in os.environ
+    deadline_secs = time.monotonic() + (HELD_SECS if is_supervised else 0.0)
+    while True:
+        try:
+            return take()
+        except AlreadyOwned as error:
+            if time.monotonic() >= deadline_secs:
+                raise
+            _log.debug("Waiting: %s", error)
+            time.sleep(_POLL_SECS)
+
+
+def on_terminate(handler: Callable[[], None]) -> None:
+    """Calls `handler` in the main thread on SIGTERM and SIGINT, and notes which it was."""
+
+    def handle(number: int, _: FrameType | None) -> None:
+        global _asked_by  # as signals are the process's, so is this
+        _asked_by = signal.Signals(number)
         handler()
 
     signal.signal(signal.SIGTERM, handle)
@@ -59,6 +100,11 @@ def on_terminate(handler: Callable[[], None]) -> None:
 def interrupt() -> None:
     """Ends the main thread as Ctrl-C does; for processes whose every state is safe on disk."""
     raise KeyboardInterrupt
+
+
+def unfinished_exit() -> int:
+    """The exit code of a process that was asked to leave before its work was finished."""
+    return TERMINATED_EXIT if _asked_by is signal.SIGTERM else INTERRUPTED_EXIT
 
 
 def log_to_stderr() -> None:

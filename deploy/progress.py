@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,9 @@ from deploy.launch import Supervised
 
 REFRESH_PER_SEC = 4
 
+TELL_SECS = 30.0
+"""Between two lines about a wait, where there is no terminal."""
+
 
 class Progress:
     """Shows the learner's newest numbers and what the processes do; feed it from any thread."""
@@ -30,6 +34,8 @@ class Progress:
         self._numbers: dict[str, float] = {}
         self._episodes: dict[int, tuple[float, float]] = {}
         self._printed = 0
+        self._waits_for = ""
+        self._told_secs = -math.inf
         self._began_secs = time.monotonic()
         self._live = Live(
             console=console, refresh_per_second=REFRESH_PER_SEC, transient=True, auto_refresh=False
@@ -63,6 +69,16 @@ class Progress:
         else:
             self._print_finished_iterations()
 
+    def wait_for(self, process: str, state: str, processes: Sequence[Supervised] = ()) -> None:
+        """Says for whom a run that is over still waits; call it several times a second."""
+        self._waits_for = f"{process}: {state} (Ctrl-C does not wait)"
+        now_secs = time.monotonic()
+        if self._console.is_terminal:
+            self.show(processes)
+        elif now_secs - self._told_secs > TELL_SECS:
+            self._told_secs = now_secs
+            self._console.print(f"waiting for {self._waits_for}", highlight=False, soft_wrap=True)
+
     def _draw(self, processes: Sequence[Supervised]) -> RenderableType:
         with self._lock:
             numbers = dict(self._numbers)
@@ -83,6 +99,8 @@ class Progress:
             table.add_row("attempts gone wrong", f"{wrong:.0f} (see the learner's log)")
         if numbers.get("paused"):
             table.add_row("state", "paused: clothbus control resume")
+        if self._waits_for:
+            table.add_row("waiting for", self._waits_for)
         restarted = [f"{p.spec.id} x{p.restarts}" for p in processes if p.restarts]
         if restarted:
             table.add_row("restarted", ", ".join(restarted))

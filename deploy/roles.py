@@ -8,13 +8,14 @@ import threading
 from pathlib import Path
 
 from broker_config.bus import open_bus
-from broker_config.heart import Pulse
+from broker_config.heart import HUNG_SECS, Pulse
 from broker_config.journal import Journal
 from broker_config.ownership import own_run
 from broker_config.preset import Preset
 from broker_config.session import open_router_on_free_port, open_session
 from broker_config.spool import Spool
-from deploy.process import interrupt, on_terminate, use_one_torch_thread
+from deploy.priority import Priority
+from deploy.process import interrupt, on_terminate, take_when_free, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from deploy.status import only_run
 
@@ -52,6 +53,7 @@ def run_router(
             partial.replace(address_file)
         _log.info("Routing at %s", listen)
         stop.wait()
+    interrupt()  # a router is never finished: it has only been asked to leave
 
 
 def run_learner(
@@ -60,6 +62,7 @@ def run_learner(
     address: str,
     device: str = "cpu",
     demonstrations: Path | None = None,
+    hung_secs: float = HUNG_SECS,
     overrides: tuple[str, ...] = (),
 ) -> None:
     """Learns until the run is complete; a second start resumes from the newest checkpoint.
@@ -81,7 +84,7 @@ def run_learner(
     on_terminate(interrupt)
     use_one_torch_thread()
     with (
-        own_run(folder.path),
+        take_when_free(lambda: own_run(folder.path)),
         Journal(folder.journal) as journal,
         open_bus(address, folder.run, "owner", "learner", overrides) as bus,
         LearningMetrics(folder.tensorboard) as metrics,
@@ -102,7 +105,9 @@ def run_learner(
             read_demonstrations(demonstrations) if demonstrations else (),
             wait_ready,
         )
-        LearnerService(bus, "learner", owner, loop, journal, snapshots, metrics, pulse).run()
+        LearnerService(
+            bus, "learner", owner, loop, journal, snapshots, metrics, pulse, hung_secs
+        ).run()
 
 
 def run_actor(
@@ -141,7 +146,7 @@ def run_actor(
     run = run or only_run(address, overrides)
     path = spool_path or Path("spools") / run / f"{actor}.sqlite"
     with (
-        Spool(path, run, actor, incarnation, SPOOL_MAX_BYTES) as spool,
+        take_when_free(lambda: Spool(path, run, actor, incarnation, SPOOL_MAX_BYTES)) as spool,
         open_bus(address, run, "actor", actor, overrides) as bus,
     ):
         process = Actor(
@@ -154,4 +159,82 @@ def run_actor(
             wrap_env=lambda env: StepLog(env, step_log, incarnation) if step_log else env,
         )
         on_terminate(process.stop)
-        process.run()
+        has_finished = process.run()
+    if not has_finished:
+        interrupt()
+
+
+def run_evaluator(
+    address: str,
+    evaluator: str,
+    folder: RunFolder,
+    episodes: int,
+    run: str | None = None,
+    priority: Priority = "idle",
+    overrides: tuple[str, ...] = (),
+) -> None:
+    """Scores the policies of a run while it goes on; leaves when its last one is scored.
+
+    Args:
+        address: The router's.
+        evaluator: This evaluator's name.
+        folder: Where results and policies go: the run's own folder, or another.
+        episodes: For each policy version and mode.
+        run: The run, or None if the router carries only one.
+        priority: Whether it gives way to everybody else on the machine.
+        overrides: Zenoh settings.
+
+    Raises:
+        AttachRefused: The owner's versions differ.
+        OwnerUnreachable: The router carries no run, or several and none was named.
+        RouterUnreachable: There is no router at the address.
+        StorageError: The folder cannot be used, or is another run's.
+    """
+    from deploy.evaluator import Evaluator
+
+    use_one_torch_thread()
+    run = run or only_run(address, overrides)
+    with open_bus(address, run, "evaluator", evaluator, overrides) as bus:
+        process = Evaluator(bus, evaluator, secrets.token_hex(8), folder, episodes, priority)
+        on_terminate(process.stop)
+        has_finished = process.run()
+    if not has_finished:
+        interrupt()
+
+
+def run_recorder(
+    address: str,
+    recorder: str,
+    folder: Path,
+    run: str | None = None,
+    overrides: tuple[str, ...] = (),
+) -> None:
+    """Records a run until it ends.
+
+    Args:
+        address: The router's.
+        recorder: This recorder's name.
+        folder: Of the recording; what is there already is gone on with.
+        run: The run, or None if the router carries only one.
+        overrides: Zenoh settings.
+
+    Raises:
+        AlreadyOwned: Another recorder has the folder or the name.
+        AttachRefused: The owner's versions differ.
+        OwnerUnreachable: The router carries no run, or several and none was named.
+        RouterUnreachable: There is no router at the address.
+        StorageError: The folder holds something that must not be touched.
+    """
+    from broker_config.recording import lock_recording
+    from deploy.recorder import Recorder
+
+    run = run or only_run(address, overrides)
+    with (
+        take_when_free(lambda: lock_recording(folder)),
+        open_bus(address, run, "recorder", recorder, overrides) as bus,
+    ):
+        process = Recorder(bus, recorder, folder, secrets.token_hex(8))
+        on_terminate(process.stop)
+        has_finished = process.run()
+    if not has_finished:
+        interrupt()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -13,18 +13,33 @@ from rich.console import Console
 from actors.step_log import StepLog
 from actors.task import make_task_env
 from broker_config.bus import Bus, open_bus
-from broker_config.errors import OwnerUnreachable
+from broker_config.errors import OwnerUnreachable, RouterUnreachable
+from broker_config.heart import HUNG_SECS
 from broker_config.journal import Journal
-from broker_config.messages import Command, Control, ControlReply, Metrics
+from broker_config.keys import Kind
+from broker_config.messages import Command, Control, ControlReply, Heartbeat, Metrics
 from broker_config.ownership import FileLock, own_run
 from broker_config.preset import Preset
+from deploy.farewell import EvaluatorFarewell
 from deploy.in_process import ACTOR, InProcessActor
 from deploy.launch import ProcessFailed, Supervisor
-from deploy.process import interrupt, on_terminate, use_one_torch_thread
+from deploy.leftovers import deliver_spools, lacks_recording
+from deploy.priority import Priority
+from deploy.process import interrupt, on_terminate, take_when_free, use_one_torch_thread
 from deploy.progress import Progress
+from deploy.recorder_farewell import RecorderFarewell
 from deploy.run_folder import RunFolder
-from deploy.summary import summarise
-from deploy.topology import actor_process, learner_process, router_process
+from deploy.summary import is_complete, summarise
+from deploy.topology import (
+    EVALUATOR,
+    RECORDER,
+    actor_process,
+    evaluator_process,
+    learner_process,
+    recorder_process,
+    router_process,
+)
+from deploy.vital_signs import VitalSigns
 from learner.checkpoint import CheckpointStore
 from learner.learning import LearningLoop
 from learner.metrics import LearningMetrics
@@ -34,10 +49,11 @@ from learner.snapshots import SnapshotStore
 from learner.trainer import Trainer
 
 ROUTER_START_SECS = 30.0
-LEAVE_SECS = 30.0
-"""How long actors have to leave once the learner has finished."""
+LEAVE_SECS = 10.0
+"""How long actors have to leave once the learner, which has told them so, has finished."""
 
 POLL_SECS = 0.1
+ASK_SECS = 2.0
 
 
 @dataclass(frozen=True)
@@ -50,11 +66,20 @@ class RunOptions:
     """Of a router that runs already; None starts one."""
     demonstrations: Path | None = None
     step_log: Path | None = None
+    evaluate: int = 0
+    """Episodes for each policy that an evaluator scores meanwhile; 0 for no evaluator."""
+    evaluator_priority: Priority = "idle"
+    hung_secs: float = HUNG_SECS
+    """A process that gets nowhere for so long is killed and started again."""
     overrides: tuple[str, ...] = ()
+    record: bool = True
+    """Into the run folder; a run in one process has no recorder."""
 
 
 def run_over_bus(folder: RunFolder, preset: Preset, options: RunOptions, console: Console) -> bool:
     """Starts router, learner and actors, shows progress, and ends them.
+
+    A run that is complete already is only given what it still owes.
 
     Returns:
         Whether the run is complete; False after Ctrl-C or `clothbus control stop`.
@@ -62,7 +87,16 @@ def run_over_bus(folder: RunFolder, preset: Preset, options: RunOptions, console
     Raises:
         ProcessFailed: A process cannot be kept alive.
     """
-    return _run(folder, preset, console, lambda show: _supervise(folder, options, show))
+
+    def carry_out(progress: Progress) -> None:
+        if not is_complete(folder):
+            _supervise(folder, options, progress)
+            return
+        deliver_spools(folder, preset)
+        if options.record and lacks_recording(folder):
+            _supervise(folder, replace(options, actors=0, evaluate=0), progress)
+
+    return _run(folder, preset, console, carry_out)
 
 
 def run_in_process(
@@ -73,7 +107,14 @@ def run_in_process(
     Returns:
         Whether the run is complete; False after Ctrl-C.
     """
-    return _run(folder, preset, console, lambda show: _play_here(folder, preset, options, show))
+
+    def carry_out(progress: Progress) -> None:
+        if is_complete(folder):
+            deliver_spools(folder, preset)
+        else:
+            _play_here(folder, preset, options, progress)
+
+    return _run(folder, preset, console, carry_out)
 
 
 def _run(
@@ -82,7 +123,7 @@ def _run(
     began_secs = time.monotonic()
     console.print(f"Run folder: {folder.path}", highlight=False, soft_wrap=True)
     on_terminate(interrupt)
-    with FileLock(folder.path / "run.lock", f"run {folder.path}"):
+    with take_when_free(lambda: FileLock(folder.path / "run.lock", f"run {folder.path}")):
         with Progress(preset, console) as progress, suppress(KeyboardInterrupt):
             carry_out(progress)
         summary = summarise(folder, time.monotonic() - began_secs)
@@ -91,44 +132,107 @@ def _run(
 
 
 def _supervise(folder: RunFolder, options: RunOptions, progress: Progress) -> None:
-    with Supervisor(folder.path / "logs") as supervisor:
+    is_resumed = folder.journal.exists()
+    signs = VitalSigns(options.hung_secs)
+    with Supervisor(folder.path / "logs", signs) as supervisor:
         address = options.address or _start_router(supervisor, folder, options)
-        learner = learner_process(
-            folder.path, address, options.device, options.demonstrations, options.overrides
-        )
-        supervisor.start(learner)
-        actors = [f"actor-{number}" for number in range(options.actors)]
-        for actor in actors:
-            spool = folder.spool(actor)
-            supervisor.start(
-                actor_process(
-                    folder.run, actor, spool, address, options.step_log, options.overrides
-                )
-            )
-        with open_bus(address, folder.run, "observer", "run", options.overrides) as bus:
+        _start_learner(supervisor, folder, address, options)
+        with ExitStack() as stack:
+            bus = _attach(stack, supervisor, address, folder.run, options)
+            bus.subscribe(bus.keys.every(Kind.LIVE), Heartbeat, signs.on_heartbeat)
+            evaluator = EvaluatorFarewell(bus, EVALUATOR) if options.evaluate else None
+            recorder = RecorderFarewell(bus, RECORDER) if options.record else None
+            if is_resumed:
+                _unpause(supervisor, bus)
+            actors = _start_actors(supervisor, folder, address, options)
             _watch(supervisor, bus, progress)
-        supervisor.wait_finished(actors, LEAVE_SECS)
+            supervisor.release(actors)
+            if evaluator is not None:
+                evaluator.wait(supervisor, progress)
+            if recorder is not None:
+                recorder.wait(supervisor)
+        supervisor.wait_ended(actors, LEAVE_SECS)
+
+
+def _start_learner(
+    supervisor: Supervisor, folder: RunFolder, address: str, options: RunOptions
+) -> None:
+    """Starts the learner and the recorder that follows it."""
+    supervisor.start(
+        learner_process(
+            folder.path,
+            address,
+            options.device,
+            options.demonstrations,
+            options.hung_secs,
+            options.overrides,
+        )
+    )
+    if options.record:
+        supervisor.start(recorder_process(folder.run, folder.recording, address, options.overrides))
+
+
+def _start_actors(
+    supervisor: Supervisor, folder: RunFolder, address: str, options: RunOptions
+) -> list[str]:
+    """Starts those who play, the evaluator among them; returns the actors' names."""
+    actors = [f"actor-{number}" for number in range(options.actors)]
+    for actor in actors:
+        spool, step_log = folder.spool(actor), options.step_log
+        supervisor.start(
+            actor_process(folder.run, actor, spool, address, step_log, options.overrides)
+        )
+    if options.evaluate:
+        supervisor.start(
+            evaluator_process(
+                folder.run,
+                folder.path,
+                options.evaluate,
+                address,
+                options.evaluator_priority,
+                options.overrides,
+            )
+        )
+    return actors
+
+
+def _attach(
+    stack: ExitStack, supervisor: Supervisor, address: str, run: str, options: RunOptions
+) -> Bus:
+    """Opens the supervisor's own bus, also when the router dies at just that moment."""
+    deadline_secs = time.monotonic() + ROUTER_START_SECS
+    while True:
+        try:
+            return stack.enter_context(open_bus(address, run, "observer", "run", options.overrides))
+        except RouterUnreachable:
+            supervisor.check()
+            if options.address or time.monotonic() > deadline_secs:
+                raise
 
 
 def _watch(supervisor: Supervisor, bus: Bus, progress: Progress) -> None:
     """Shows progress and keeps the processes alive until the learner has finished."""
     bus.subscribe(bus.keys.metrics("owner", "learner"), Metrics, progress.on_metrics)
-    is_unpaused = False
     while not supervisor.has_finished("learner"):
         supervisor.check()
         progress.show(supervisor.processes)
-        is_unpaused = is_unpaused or _unpause(bus)
         time.sleep(POLL_SECS)
     progress.show(supervisor.processes)
 
 
-def _unpause(bus: Bus) -> bool:
-    """A run that a person starts again shall go on, also if it was paused when it was left."""
-    try:
-        bus.ask(bus.keys.control, Control(Command.RESUME), ControlReply, timeout_secs=POLL_SECS)
-    except OwnerUnreachable:
-        return False
-    return True
+def _unpause(supervisor: Supervisor, bus: Bus) -> None:
+    """A run that a person starts again shall go on, also if it was paused when it was left.
+
+    It is done before there are actors: one that was drained then would leave again.
+    """
+    while not supervisor.has_finished("learner"):
+        supervisor.check()
+        try:
+            bus.ask(bus.keys.control, Control(Command.RESUME), ControlReply, timeout_secs=ASK_SECS)
+        except OwnerUnreachable:
+            time.sleep(POLL_SECS)
+        else:
+            return
 
 
 def _start_router(supervisor: Supervisor, folder: RunFolder, options: RunOptions) -> str:
@@ -152,7 +256,7 @@ def _play_here(folder: RunFolder, preset: Preset, options: RunOptions, progress:
     use_one_torch_thread()
     task = make_task_env(preset.task)
     with (
-        own_run(folder.path),
+        take_when_free(lambda: own_run(folder.path)),
         Journal(folder.journal) as journal,
         LearningMetrics(folder.tensorboard) as metrics,
         closing(StepLog(task, options.step_log, ACTOR) if options.step_log else task) as env,

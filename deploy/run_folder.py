@@ -60,6 +60,11 @@ class RunFolder:
         return self.path / "film_strip.png"
 
     @property
+    def recording(self) -> Path:
+        """The recorder's copy of the journal and of the live traffic, as MCAP."""
+        return self.path / "recording"
+
+    @property
     def router_address(self) -> Path:
         """Where the embedded router of the run listens."""
         return self.path / "router.address"
@@ -71,8 +76,13 @@ class RunFolder:
 
     @property
     def evaluation(self) -> Path:
-        """Every episode that `clothbus evaluate` has played."""
+        """Every episode that an evaluation has played, live or afterwards."""
         return self.path / "evaluation.jsonl"
+
+    @property
+    def evaluation_tensorboard(self) -> Path:
+        """The evaluator's part of the TensorBoard logs."""
+        return self.tensorboard / "evaluation"
 
     def log(self, process: str) -> Path:
         """What a process wrote to its standard output and error."""

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from broker_config.bus import Bus, open_bus
 from broker_config.errors import OwnerUnreachable
+from broker_config.heart import HUNG_SECS
 from broker_config.keys import Kind, ParsedKey
 from broker_config.liveliness import runs_on
 from broker_config.messages import Command, Control, ControlReply, Heartbeat
@@ -106,6 +107,10 @@ def status_table(run: str, processes: list[ProcessStatus]) -> Table:
         beat = process.heartbeat
         if beat is None:
             table.add_row(process.role, process.id, "?", "[red]hangs: alive, but silent[/red]")
+            continue
+        if beat.stalled_secs > HUNG_SECS:
+            standstill = f"hangs: main thread at a standstill for {beat.stalled_secs:.0f} s"
+            table.add_row(process.role, process.id, beat.host, f"[red]{standstill}[/red]")
             continue
         version = beat.numbers.get("policy_version")
         newest = numbers.get("policy_version")

@@ -6,7 +6,15 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from broker_config.heart import HUNG_SECS
 from broker_config.messages import Role
+from deploy.priority import Priority
+
+RECORDER = "recorder"
+"""Under which name a run's own recorder is there."""
+
+EVALUATOR = "evaluator"
+"""Under which name a run's own evaluator is there."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +43,13 @@ def learner_process(
     address: str,
     device: str = "cpu",
     demonstrations: Path | None = None,
+    hung_secs: float = HUNG_SECS,
     overrides: tuple[str, ...] = (),
 ) -> ProcessSpec:
     """The learner of a run folder."""
     given = ("--demonstrations", str(demonstrations)) if demonstrations else ()
     arguments = ("learner", str(folder), "--connect", address, "--device", device, *given)
+    arguments += ("--hung-secs", str(hung_secs))
     return ProcessSpec("owner", "learner", (*arguments, *_zenoh(overrides)))
 
 
@@ -55,6 +65,37 @@ def actor_process(
     arguments = ("actor", "--run", run, "--id", actor, "--connect", address, "--spool", str(spool))
     logged = ("--step-log", str(step_log)) if step_log else ()
     return ProcessSpec("actor", actor, (*arguments, *logged, *_zenoh(overrides)))
+
+
+def recorder_process(
+    run: str, folder: Path, address: str, overrides: tuple[str, ...] = ()
+) -> ProcessSpec:
+    """The recorder of a run."""
+    arguments = ("record", "--run", run, "--output", str(folder), "--connect", address)
+    return ProcessSpec("recorder", RECORDER, (*arguments, *_zenoh(overrides)))
+
+
+def evaluator_process(
+    run: str,
+    folder: Path,
+    episodes: int,
+    address: str,
+    priority: Priority = "idle",
+    overrides: tuple[str, ...] = (),
+) -> ProcessSpec:
+    """The evaluator of a run, which writes into the run's folder."""
+    where = ("--run", run, "--output", str(folder), "--connect", address)
+    arguments = (
+        "evaluator",
+        "--id",
+        EVALUATOR,
+        *where,
+        "--episodes",
+        str(episodes),
+        "--priority",
+        priority,
+    )
+    return ProcessSpec("evaluator", EVALUATOR, (*arguments, *_zenoh(overrides)))
 
 
 def _zenoh(overrides: tuple[str, ...]) -> tuple[str, ...]:

@@ -205,16 +205,11 @@ class LearningLoop:
         self._owner.policy_ready(SnapshotTaken(self._version, snapshot.digest, self._absorbed))
         reach(Failpoint.SNAPSHOT_JOURNALED)
         # Whoever records gets every version, however far behind it is.
-        wanted = self._pinned_versions() | self._owner.followers.missing_versions()
+        pinned = frozenset(self._schedule.iteration_versions())
+        wanted = pinned | self._owner.followers.missing_versions()
         self._snapshots.retain(self._schedule.policy_lag + 2, wanted)
         report, self._report = self._report, None
         return PolicyReady(snapshot, self._absorbed, report)
-
-    def _pinned_versions(self) -> frozenset[int]:
-        """The untrained policy and one version for each iteration are kept for evaluation."""
-        per_iteration = self._schedule.episodes_per_iteration
-        ends = range(0, self._schedule.episodes + 1, per_iteration)
-        return frozenset(self._schedule.updates_before(end) for end in ends)
 
     def _iteration(self, number: int) -> IterationEnded:
         per_iteration = self._schedule.episodes_per_iteration

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from torch.utils.tensorboard.writer import SummaryWriter
+from tensorboard.compat.proto.summary_pb2 import Summary
+from torch.utils.tensorboard.writer import FileWriter
 
 from learner.learning import EpisodeAbsorbed, PolicyReady
 
@@ -22,7 +23,7 @@ class LearningMetrics:
         """Opens TensorBoard's log folder; a resumed run adds a file to it."""
         self.numbers: dict[str, float] = {}
         self.step = 0
-        self._writer = SummaryWriter(str(folder))
+        self._writer = FileWriter(str(folder))
         self._began_secs = time.monotonic()
         self._transitions = 0
 
@@ -34,8 +35,9 @@ class LearningMetrics:
             case PolicyReady():
                 new, self.step = _of_policy(event), event.absorbed
         self.numbers.update(new)
-        for name, number in new.items():
-            self._writer.add_scalar(name, number, self.step)
+        # One event for all: one for each number would cost more than absorbing the episode.
+        values = [Summary.Value(tag=name, simple_value=number) for name, number in new.items()]
+        self._writer.add_summary(Summary(value=values), self.step)
 
     def _of_episode(self, episode: EpisodeAbsorbed) -> dict[str, float]:
         self._transitions += episode.steps

@@ -85,8 +85,11 @@ class Owner:
         self.changed = threading.Condition()
         self.changes = 0
         self._journal = journal
-        self._book = TicketBook(preset)
-        self._stored: set[TrajectoryId] = set()
+        self._book = TicketBook(preset, self._issued_before)
+        self._uncommitted: dict[TrajectoryId, Verdict] = {}
+        """Trajectories on their way to the disk; all others are looked up in the journal."""
+        self._newest: dict[tuple[str, str], int] = {}
+        """Highest sequence number by actor and incarnation: what is above it never arrived."""
         self._latest_version = -1
         self._paused = False
         self._stopping = False
@@ -168,6 +171,13 @@ class Owner:
         """What a request gets when its long poll ends without a ticket."""
         return self._reply(request, Instruction.WAIT)
 
+    def has_news_for(self, actor: str) -> bool:
+        """Whether a request of an actor that was not answered before would be now."""
+        with self.changed:
+            if self._failure is not None or self._farewell(actor) is not None:
+                return True
+            return not self._paused and self._book.may_issue(self._latest_version)
+
     def heard(self, actor: str, incarnation: str, now_secs: float) -> None:
         """Renews an actor's leases."""
         with self.changed:
@@ -198,10 +208,12 @@ class Owner:
         with self.changed:
             self._require_sound()
             self._require_going_on()
-            known = self._book.verdict(trajectory.id)
+            known = self._verdict(trajectory.id)
             events = [] if known else self._book.close(trajectory)
-            verdict = known or self._book.verdict(trajectory.id)
-            assert verdict is not None
+            verdict = known or _verdict_in(events)
+            if not known:
+                self._uncommitted[trajectory.id] = verdict
+                self._note_arrival(trajectory.id)
             appended = self._append_events(events, (trajectory_name(trajectory.id), payload))
         ack: Future[Ack] = Future()
 
@@ -211,13 +223,30 @@ class Owner:
                 return
             stored = done.result()[0]
             with self.changed:
-                self._stored.add(trajectory.id)
+                self._uncommitted.pop(trajectory.id, None)
                 self.note_change()
             is_duplicate = not stored.is_new
             ack.set_result(Ack(trajectory.id, self.epoch, stored.offset, verdict, is_duplicate))
 
         appended.add_done_callback(acknowledge)
         return ack
+
+    def _verdict(self, trajectory: TrajectoryId) -> Verdict | None:
+        """What became of a trajectory, or None if it never arrived."""
+        if trajectory.sequence > self._newest.get(_process_of(trajectory), -1):
+            return None
+        if (verdict := self._uncommitted.get(trajectory)) is not None:
+            return verdict
+        entry = self._journal.find(f"ended/{trajectory}")
+        return None if entry is None else decode(entry.payload, AttemptEnded).verdict
+
+    def _note_arrival(self, trajectory: TrajectoryId) -> None:
+        process = _process_of(trajectory)
+        self._newest[process] = max(trajectory.sequence, self._newest.get(process, -1))
+
+    def _issued_before(self, index: int, attempt: int) -> TicketIssued | None:
+        entry = self._journal.find(f"ticket/{index}/{attempt}")
+        return None if entry is None else decode(entry.payload, TicketIssued)
 
     # What the learning loop asks --------------------------------------------------------------
 
@@ -245,9 +274,8 @@ class Owner:
     def is_ready(self, index: int) -> bool:
         """Whether ticket `index` is complete and durable."""
         with self.changed:
-            return self._book.is_complete(index) and self._stored.issuperset(
-                self._book.parts(index)
-            )
+            is_complete = self._book.is_complete(index)
+            return is_complete and self._uncommitted.keys().isdisjoint(self._book.parts(index))
 
     def wait_ready(self, index: int, timeout_secs: float) -> bool:
         """Waits until ticket `index` is complete and durable, or the time or the run is over.
@@ -305,8 +333,11 @@ class Owner:
             self.note_change()
 
     def iteration_ended(self, iteration: IterationEnded) -> None:
-        """Journals the end of an iteration."""
+        """Journals the end of an iteration; its tickets need not be asked for again."""
         self._append((f"iteration/{iteration.iteration}", iteration)).result()
+        per_iteration = self.preset.schedule.episodes_per_iteration
+        with self.changed:
+            self._book.forget_before((iteration.iteration + 1) * per_iteration)
 
     # Followers --------------------------------------------------------------------------------
 
@@ -360,13 +391,20 @@ class Owner:
         """
         with self.changed:
             self._require_sound()
-            self._controls += 1
-            future = self._append((f"control/{self.epoch}/{self._controls}", control))
+            future = self._append(*self._numbered(control, actors))
             self._apply_control(control, actors)
             self.note_change()
             state = "stopping" if self._stopping else "paused" if self._paused else "running"
         future.result()
         return ControlReply(control.command, state)
+
+    def _numbered(self, control: Control, actors: Iterable[str]) -> list[tuple[str, Control]]:
+        """The entries of a command; who was there is part of the record of a `drain` of all."""
+        named = [control]
+        if control.command is Command.DRAIN and control.process is None:
+            named += [Control(Command.DRAIN, actor) for actor in actors]
+        first, self._controls = self._controls + 1, self._controls + len(named)
+        return [(f"control/{self.epoch}/{n}", item) for n, item in enumerate(named, first)]
 
     def stop(self) -> None:
         """Ends the run early: actors are told, `wait_ready` returns."""
@@ -446,8 +484,8 @@ class Owner:
                 case TicketIssued() | AttemptEnded() | TicketReseeded() as event:
                     self._book.apply(event)
                     if isinstance(event, AttemptEnded) and event.trajectory is not None:
-                        self._stored.add(event.trajectory)
-                case Control(command=Command.PAUSE | Command.RESUME | Command.FORGET) as control:
+                        self._note_arrival(event.trajectory)
+                case Control() as control if control.command is not Command.STOP:
                     self._apply_control(control, ())
                 case FollowerJoined() as joined:
                     self.followers.apply(joined)
@@ -461,6 +499,14 @@ class Owner:
                 f"journal: expected preset {self.preset.name} ({self.preset.digest[:12]}); "
                 "got a run of another preset; resume it with its own, or choose another run folder"
             )
+
+
+def _process_of(trajectory: TrajectoryId) -> tuple[str, str]:
+    return trajectory.actor, trajectory.incarnation
+
+
+def _verdict_in(events: Sequence[TicketEvent]) -> Verdict:
+    return next(event.verdict for event in events if isinstance(event, AttemptEnded))
 
 
 def _named(event: TicketEvent) -> tuple[str, TicketEvent]:

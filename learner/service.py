@@ -8,7 +8,6 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 
 from broker_config.bus import Bus, Publisher
-from broker_config.codec import encode
 from broker_config.errors import AlreadyOwned, BusError
 from broker_config.failpoints import Failpoint, reach
 from broker_config.heart import HUNG_SECS, Heart, Pulse
@@ -68,6 +67,7 @@ class LearnerService:
         snapshots: SnapshotStore,
         metrics: LearningMetrics,
         pulse: Pulse,
+        hung_secs: float = HUNG_SECS,
     ) -> None:
         """Joins the parts.
 
@@ -80,6 +80,7 @@ class LearnerService:
             snapshots: The loop's.
             metrics: Where the numbers go.
             pulse: Beaten by the loop's trainer too, so that a long update is no stall.
+            hung_secs: An actor whose main thread gets nowhere for so long loses its tickets.
         """
         self._bus = bus
         self._name = name
@@ -89,6 +90,7 @@ class LearnerService:
         self._snapshots = snapshots
         self._metrics = metrics
         self._pulse = pulse
+        self._hung_secs = hung_secs
         self._keys = bus.keys
         self._state = "starting"
         self._heard: dict[str, tuple[str, float]] = {}
@@ -101,6 +103,7 @@ class LearnerService:
             desk = stack.enter_context(TicketDesk(self._owner))
             self._serve(desk)
             incarnation = f"epoch-{self._owner.epoch}"
+            self._pulse.beat()  # what came before is the start, and no standstill
             stack.enter_context(
                 Heart(
                     self._bus,
@@ -152,7 +155,7 @@ class LearnerService:
         followers = self._owner.followers
         followers.expect(time.monotonic())
         while behind := followers.behind(end_offset, time.monotonic() - FOLLOWER_SECS):
-            self._state = f"waiting for {', '.join(behind)}"
+            self._state = f"finished, waits for {', '.join(behind)}"
             self._pulse.beat()
             time.sleep(POLL_SECS)
 
@@ -195,7 +198,7 @@ class LearnerService:
         if heartbeat.role == "actor":
             now_secs = time.monotonic()
             self._heard[heartbeat.id] = heartbeat.incarnation, now_secs
-            if heartbeat.stalled_secs > HUNG_SECS:
+            if heartbeat.stalled_secs > self._hung_secs:
                 return  # its tickets go to others
             self._owner.heard(heartbeat.id, heartbeat.incarnation, now_secs)
 
@@ -224,7 +227,8 @@ class LearnerService:
                 to.reply(ack.result())
 
         reach(Failpoint.TRAJECTORY_RECEIVED)
-        self._owner.receive(trajectory, encode(trajectory)).add_done_callback(answer)
+        # Kept as it was sent: encoding it again would cost as much as all the rest.
+        self._owner.receive(trajectory, to.question).add_done_callback(answer)
 
     def _on_snapshot_request(self, _: ParsedKey, request: SnapshotRequest, to: Responder) -> None:
         weights = self._snapshots.get(request.version)

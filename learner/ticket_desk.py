@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 from broker_config.failpoints import Failpoint, reach
+from broker_config.journal import Appended
 from broker_config.messages import TicketReply, TicketRequest
 from learner.owner import Owner
 
@@ -20,11 +23,13 @@ POLL_SECS = 2.0
 LEASE_CHECK_SECS = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Held:
     request: TicketRequest
     answer: Callable[[TicketReply], None]
     deadline_secs: float
+    was_decided: bool = False
+    """The owner has seen it, and had nothing."""
 
 
 class TicketDesk:
@@ -68,9 +73,12 @@ class TicketDesk:
 
     def _run(self) -> None:
         try:
+            leases_checked_secs = -math.inf
             while not self._closing:
                 seen = self._owner.changes
-                self._owner.expire_leases(time.monotonic())
+                if (now_secs := time.monotonic()) >= leases_checked_secs + LEASE_CHECK_SECS:
+                    self._owner.expire_leases(now_secs)
+                    leases_checked_secs = now_secs
                 self._decide_all()
                 with self._owner.changed:
                     self._owner.changed.wait_for(
@@ -93,14 +101,27 @@ class TicketDesk:
 
     def _try_answer(self, held: _Held) -> bool:
         now_secs = time.monotonic()
-        issued = self._owner.issue(held.request, now_secs)
-        if issued is not None:
-            reply, committed = issued
-            committed.result()
-            reach(Failpoint.TICKET_JOURNALED)
-            held.answer(reply)
-            return True
+        # With many actors waiting, asking for each of them after each change would take all time.
+        if not held.was_decided or self._owner.has_news_for(held.request.actor):
+            issued = self._owner.issue(held.request, now_secs)
+            if issued is not None:
+                _answer_once_committed(held, *issued)
+                return True
+            held.was_decided = True
         if now_secs >= held.deadline_secs:
             held.answer(self._owner.wait_reply(held.request))
             return True
         return False
+
+
+def _answer_once_committed(
+    held: _Held, reply: TicketReply, committed: Future[tuple[Appended, ...]]
+) -> None:
+    """Others need not wait for this commit; if it fails, the owner ends the run with the reason."""
+
+    def answer(done: Future[tuple[Appended, ...]]) -> None:
+        if done.exception() is None:
+            reach(Failpoint.TICKET_JOURNALED)
+            held.answer(reply)
+
+    committed.add_done_callback(answer)

@@ -3,11 +3,16 @@
 The book is a fold over the journal's events `TicketIssued`, `AttemptEnded` and `TicketReseeded`: it
 changes only in `apply`, and replaying the journal after a restart gives the same book. Leases are
 the one thing that is not journaled: they say who was heard of lately.
+
+In memory is what is still open. What has ended is looked up in the journal when somebody asks for
+it, so that a run may have any number of tickets.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -35,13 +40,46 @@ LEASE_SECS = 5.0
 """An actor not heard of for this long has lost its tickets; heartbeats come ten times as often."""
 
 
+@functools.lru_cache(maxsize=256)  # asked for when a ticket is issued and when it is judged
 def derive_seed(run_seed: int, index: int, generation: int, part: int) -> int:
     """The seed of an episode: the same on every machine, different for every argument."""
     words = np.random.SeedSequence([run_seed, index, generation, part]).generate_state(2, np.uint32)
     return (int(words[0]) << 31) ^ int(words[1])
 
 
-@dataclass
+def make_ticket(
+    preset: Preset,
+    index: int,
+    *,
+    attempt: int = 0,
+    generation: int = 0,
+    part: int = 0,
+    steps_before: int = 0,
+) -> Ticket:
+    """The ticket of an episode: by default, of its first attempt.
+
+    Args:
+        preset: Of the run.
+        index: Place of the episode in the run.
+        attempt: Counts the issues of this index.
+        generation: Counts the seeds that were replaced.
+        part: Counts the trajectories already accepted for this index.
+        steps_before: Steps of these.
+    """
+    exploration = preset.exploration
+    explores = preset.algorithm.method == "dqn" and exploration is not None
+    return Ticket(
+        index=index,
+        attempt=attempt,
+        part=part,
+        seed=derive_seed(preset.seed, index, generation, part),
+        policy_version=preset.schedule.policy_version(index),
+        steps=preset.task.horizon - steps_before,
+        epsilon=exploration.epsilon(index) if exploration and explores else 0.0,
+    )
+
+
+@dataclass(slots=True)
 class _TicketState:
     generation: int = 0
     attempts: int = 0
@@ -49,9 +87,13 @@ class _TicketState:
     lost: int = 0
     steps: int = 0
     complete: bool = False
-    parts: list[TrajectoryId] = field(default_factory=list)
-    issued: dict[int, TicketIssued] = field(default_factory=dict)
-    """By attempt."""
+    parts: tuple[TrajectoryId, ...] = ()
+    outstanding: int = 0
+    """Attempts that are being collected."""
+
+
+IssuedBefore = Callable[[int, int], TicketIssued | None]
+"""Finds, by index and attempt, what was issued and is no longer being collected."""
 
 
 class TicketBook:
@@ -61,14 +103,24 @@ class TicketBook:
     caller journals them before it tells anyone.
     """
 
-    def __init__(self, preset: Preset) -> None:
+    def __init__(self, preset: Preset, issued_before: IssuedBefore) -> None:
+        """An empty book.
+
+        Args:
+            preset: Of the run.
+            issued_before: Looks into the journal.
+        """
         self._preset = preset
         self._schedule = preset.schedule
-        self._tickets: list[_TicketState] = []
+        self._issued_before = issued_before
+        self._tickets: dict[int, _TicketState] = {}
+        """Of the tickets that were not forgotten."""
+        self._next_new = 0
         self._first_incomplete = 0
+        self._free: set[int] = set()
+        """Tickets to be collected again: incomplete, and nobody is at it."""
         self._outstanding: dict[tuple[int, int], TicketIssued] = {}
         self._last_request: dict[str, TicketIssued] = {}
-        self._verdicts: dict[TrajectoryId, Verdict] = {}
         self._heard_at_secs: dict[tuple[str, str], float] = {}
 
     # What is known ----------------------------------------------------------------------------
@@ -80,15 +132,22 @@ class TicketBook:
 
     def is_complete(self, index: int) -> bool:
         """Whether ticket `index` has all its steps."""
-        return index < len(self._tickets) and self._tickets[index].complete
+        if index < self._first_incomplete:
+            return True
+        return index in self._tickets and self._tickets[index].complete
 
     def parts(self, index: int) -> tuple[TrajectoryId, ...]:
         """The accepted trajectories of a ticket, in order."""
-        return tuple(self._tickets[index].parts)
+        return self._tickets[index].parts
 
-    def verdict(self, trajectory: TrajectoryId) -> Verdict | None:
-        """What became of a trajectory, or None if it never arrived."""
-        return self._verdicts.get(trajectory)
+    def may_issue(self, latest_version: int) -> bool:
+        """Whether there is a ticket to be collected on a policy version that exists."""
+        return self._next_index(latest_version) is not None
+
+    def forget_before(self, index: int) -> None:
+        """Drops what is kept of the complete tickets before one; nobody asks for their parts."""
+        for finished in [it for it in self._tickets if it < min(index, self._first_incomplete)]:
+            del self._tickets[finished]
 
     # Decisions --------------------------------------------------------------------------------
 
@@ -153,7 +212,16 @@ class TicketBook:
             heard_at = self._heard_at_secs.setdefault((issued.actor, issued.incarnation), now_secs)
             if now_secs - heard_at > LEASE_SECS:
                 events += self._lose(issued, f"{issued.actor} not heard of for {LEASE_SECS:g} s")
+        self._forget_silent(now_secs)
         return events
+
+    def _forget_silent(self, now_secs: float) -> None:
+        holders = {(issued.actor, issued.incarnation) for issued in self._outstanding.values()}
+        self._heard_at_secs = {
+            process: heard_at
+            for process, heard_at in self._heard_at_secs.items()
+            if process in holders or now_secs - heard_at <= LEASE_SECS
+        }
 
     def apply(self, event: TicketEvent) -> None:
         """Changes the book by one event, whether it was just decided or is replayed."""
@@ -163,8 +231,8 @@ class TicketBook:
             case AttemptEnded():
                 self._apply_ended(event)
             case TicketReseeded(ticket=index, generation=generation):
-                state = self._tickets[index]
-                state.generation, state.invalid, state.lost = generation, 0, 0
+                if (state := self._tickets.get(index)) is not None:
+                    state.generation, state.invalid, state.lost = generation, 0, 0
 
     # Inside -----------------------------------------------------------------------------------
 
@@ -174,28 +242,37 @@ class TicketBook:
 
     def _apply_issued(self, event: TicketIssued) -> None:
         ticket = event.ticket
-        while len(self._tickets) <= ticket.index:
-            self._tickets.append(_TicketState())
-        state = self._tickets[ticket.index]
+        state = self._tickets.setdefault(ticket.index, _TicketState())
         state.attempts = ticket.attempt + 1
-        state.issued[ticket.attempt] = event
+        state.outstanding += 1
+        self._next_new = max(self._next_new, ticket.index + 1)
+        self._free.discard(ticket.index)
         self._outstanding[ticket.index, ticket.attempt] = event
         self._last_request[event.actor] = event
 
     def _apply_ended(self, event: AttemptEnded) -> None:
-        if event.trajectory is not None:
-            self._verdicts[event.trajectory] = event.verdict
         if event.verdict is Verdict.UNASKED:
             return
-        state = self._tickets[event.ticket]
-        self._outstanding.pop((event.ticket, event.attempt), None)
+        ended = self._outstanding.pop((event.ticket, event.attempt), None)
+        state = self._tickets.get(event.ticket)
+        if state is None:
+            return  # it came after the ticket was complete and forgotten
+        state.outstanding -= ended is not None
+        self._count_ended(state, event)
+        if state.complete:
+            self._free.discard(event.ticket)
+            while self.is_complete(self._first_incomplete):
+                self._first_incomplete += 1
+        elif not state.outstanding:
+            self._free.add(event.ticket)
+
+    @staticmethod
+    def _count_ended(state: _TicketState, event: AttemptEnded) -> None:
         match event.verdict:
             case Verdict.ACCEPTED if event.trajectory is not None:
-                state.parts.append(event.trajectory)
+                state.parts = (*state.parts, event.trajectory)
                 state.steps += event.steps
                 state.complete = event.is_last_part
-                while self.is_complete(self._first_incomplete):
-                    self._first_incomplete += 1
             case Verdict.INVALID:
                 state.invalid += 1
             case Verdict.LOST:
@@ -221,9 +298,9 @@ class TicketBook:
         return [self._applied(lost), *self._reseed_if_hopeless(ticket.index)]
 
     def _reseed_if_hopeless(self, index: int) -> list[TicketEvent]:
-        if index >= len(self._tickets):
+        state = self._tickets.get(index)
+        if state is None or state.complete:
             return []
-        state = self._tickets[index]
         hopeless = (
             state.invalid >= INVALID_ATTEMPTS_BEFORE_RESEED
             or state.lost >= LOST_ATTEMPTS_BEFORE_RESEED
@@ -231,33 +308,28 @@ class TicketBook:
         return [self._applied(TicketReseeded(index, state.generation + 1))] if hopeless else []
 
     def _next_index(self, latest_version: int) -> int | None:
-        being_collected = {index for index, _ in self._outstanding}
-        for index in range(self._first_incomplete, len(self._tickets)):
-            if not self._tickets[index].complete and index not in being_collected:
-                return index
-        index = len(self._tickets)
+        if self._free:
+            return min(self._free)
+        index = self._next_new
         if index == self._schedule.episodes:
             return None
         return index if self._schedule.policy_version(index) <= latest_version else None
 
     def _make_ticket(self, index: int) -> Ticket:
-        state = self._tickets[index] if index < len(self._tickets) else _TicketState()
-        exploration = self._preset.exploration
-        is_dqn = self._preset.algorithm.method == "dqn"
-        return Ticket(
-            index=index,
+        state = self._tickets.get(index, _TicketState())
+        return make_ticket(
+            self._preset,
+            index,
             attempt=state.attempts,
+            generation=state.generation,
             part=len(state.parts),
-            seed=self._seed(index),
-            policy_version=self._schedule.policy_version(index),
-            steps=self._preset.task.horizon - state.steps,
-            epsilon=exploration.epsilon(index) if is_dqn and exploration else 0.0,
+            steps_before=state.steps,
         )
 
     def _judge(self, trajectory: Trajectory) -> tuple[Verdict, str]:
         ticket, steps = trajectory.ticket, trajectory.steps
-        state = self._tickets[ticket.index] if ticket.index < len(self._tickets) else _TicketState()
-        issued, id_ = state.issued.get(ticket.attempt), trajectory.id
+        key, id_ = (ticket.index, ticket.attempt), trajectory.id
+        issued = self._outstanding.get(key) or self._issued_before(*key)
         is_holder = issued and (issued.actor, issued.incarnation) == (id_.actor, id_.incarnation)
         if issued is None or issued.ticket != ticket or not is_holder:
             return Verdict.UNASKED, f"ticket {ticket.index} was not issued like this"
@@ -266,11 +338,14 @@ class TicketBook:
         ended_early = steps < ticket.steps and not trajectory.terminated
         if steps > ticket.steps or (ended_early and not trajectory.interrupted):
             return Verdict.INVALID, f"expected {ticket.steps} steps; got {steps}"
-        is_current = (ticket.part, ticket.seed) == (len(state.parts), self._seed(ticket.index))
-        if state.complete or not is_current:
+        if self.is_complete(ticket.index) or not self._is_current(ticket):
             return Verdict.SPARE, "another attempt was complete first"
         return Verdict.ACCEPTED, ""
 
+    def _is_current(self, ticket: Ticket) -> bool:
+        parts = len(self._tickets[ticket.index].parts)
+        return (ticket.part, ticket.seed) == (parts, self._seed(ticket.index))
+
     def _seed(self, index: int) -> int:
-        state = self._tickets[index] if index < len(self._tickets) else _TicketState()
+        state = self._tickets.get(index, _TicketState())
         return derive_seed(self._preset.seed, index, state.generation, len(state.parts))

@@ -115,7 +115,9 @@ class PyBulletProcessEngine:
                 stdout=subprocess.PIPE,
                 stderr=self._complaints,
                 env={**os.environ, "PYTHONPATH": python_path},
-                start_new_session=True,  # an interrupt from the terminal is for the owner alone
+                # An interrupt from the terminal is for the owner alone. Not a session of its own:
+                # the kernel shares time among sessions, so that it would not have our low priority.
+                process_group=0,
                 bufsize=0,
             )
         except OSError as error:

@@ -9,14 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.acting import Greedy, collecting_policy
-from actors.envs import ClothbusEnv, make_env
+from actors.envs import ClothbusEnv
 from actors.policy import Policy
-from actors.rollout import ActingPolicy, Start, Step, rollout
-from broker_config.messages import Ticket
+from actors.rollout import ActingPolicy, Step, collect, rollout
+from actors.task import make_task_env
+from broker_config.messages import TrajectoryId
 from broker_config.preset import Preset
 from broker_config.structure import from_plain, to_plain
 from learner.checkpoint import CheckpointStore
-from learner.tickets import derive_seed
+from learner.tickets import make_ticket
 from learner.trainer import Trainer, UpdateReport
 
 
@@ -74,9 +75,8 @@ class InProcessRun:
 
     def finish(self, iterations: int | None = None) -> Iterator[CurvePoint]:
         """Runs what is left of so many iterations, or of all; yields each once it is on disk."""
-        task = self._preset.task
         last = self._preset.schedule.iterations if iterations is None else iterations
-        env = make_env(task.environment, horizon=task.horizon, **task.options)
+        env = make_task_env(self._preset.task)
         try:
             while len(self.points) < last:
                 self.points.append(self._iterate(env))
@@ -97,7 +97,7 @@ class InProcessRun:
         policy = self._policy()
         for index in range(first, first + schedule.episodes_per_iteration):
             acting = collecting_policy(self._preset.algorithm, policy)
-            returns.append(self._collect(env, acting, self._ticket(index)))
+            returns.append(self._collect(env, acting, index))
             if schedule.updates_after(index):
                 report = self._trainer.update()
                 policy = self._policy()
@@ -121,33 +121,16 @@ class InProcessRun:
     def _policy(self) -> Policy:
         return Policy(self._preset.network, self._trainer.weights())
 
-    def _ticket(self, index: int) -> Ticket:
-        exploration = self._preset.exploration
-        explores = self._preset.algorithm.method == "dqn" and exploration is not None
-        return Ticket(
-            index=index,
-            attempt=0,
-            part=0,
-            seed=derive_seed(self._preset.seed, index, 0, 0),
-            policy_version=self._preset.schedule.policy_version(index),
-            steps=self._preset.task.horizon,
-            epsilon=exploration.epsilon(index) if exploration and explores else 0.0,
-        )
-
-    def _collect(self, env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> float:
+    def _collect(self, env: ClothbusEnv, policy: ActingPolicy, index: int) -> float:
         """Plays an episode into the memory; returns its return."""
-        start, *rest = rollout(env, policy, ticket)
-        assert isinstance(start, Start)
-        steps = [step for step in rest if isinstance(step, Step)]
-        rewards = np.array([step.reward for step in steps], np.float32)
+        id_ = TrajectoryId("in-process", "in-process", index)
+        played = collect(env, policy, make_ticket(self._preset, index), id_)
         self._trainer.add(
-            np.stack([start.observation, *(step.observation for step in steps)]),
-            np.array([step.action for step in steps], np.int32),
-            rewards,
-            terminated=steps[-1].terminated,
+            played.observations, played.actions, played.rewards, terminated=played.terminated
         )
-        return float(rewards.sum(dtype=np.float64))
+        return played.return_
 
     def _return(self, env: ClothbusEnv, policy: ActingPolicy) -> float:
-        steps = rollout(env, policy, self._ticket(0))
+        """The return of the run's first episode, in float64 where messages carry float32."""
+        steps = rollout(env, policy, make_ticket(self._preset, 0))
         return sum(step.reward for step in steps if isinstance(step, Step))

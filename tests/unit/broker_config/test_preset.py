@@ -79,6 +79,15 @@ def test_versions_that_tickets_act_on():
     assert by_iteration.episodes == 20
 
 
+@pytest.mark.parametrize("update_every", ["episode", "iteration"])
+def test_the_versions_that_are_kept_end_the_iterations(update_every):
+    schedule = preset_from_toml(TOML, [f"schedule.update_every={update_every}"]).schedule
+    versions = schedule.iteration_versions()
+    assert versions == ((0, 5, 10, 15, 20) if update_every == "episode" else (0, 1, 2, 3, 4))
+    assert [schedule.episodes_before(version) for version in versions] == [0, 5, 10, 15, 20]
+    assert all(schedule.updates_before(schedule.episodes_before(it)) == it for it in versions)
+
+
 def test_exploration_falls_linearly():
     overrides = [
         "algorithm.method=dqn",

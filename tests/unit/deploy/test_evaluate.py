@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from broker_config.errors import StorageError
-from deploy.evaluate import bootstrap_interval, evaluate
+from actors.policy import Policy
+from broker_config.errors import AlreadyOwned, PresetError, StorageError
+from deploy import evaluation
+from deploy.evaluate import evaluate
+from deploy.evaluation import (
+    Episode,
+    Player,
+    Results,
+    bootstrap_interval,
+    modes_of,
+    read_results,
+    scores_of,
+)
+from deploy.evaluator import next_episode
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, create_run_folder
 from learner.snapshots import SnapshotStore
@@ -70,3 +84,116 @@ def test_the_bootstrap_interval_holds_the_mean_as_often_as_it_says() -> None:
         low, high = bootstrap_interval(generator.normal(5.0, 2.0, 30).tolist(), seed=0)
         hits += low < 5.0 < high
     assert 0.88 < hits / 200 < 0.99
+
+
+def test_dqn_has_no_sampled_mode(tmp_path: Path) -> None:
+    preset = load_preset("reaching-smoke", ["algorithm.method='dqn'"])
+    assert modes_of(preset.algorithm) == ("greedy",)
+    with pytest.raises(PresetError, match="expected mode greedy; got sampled"):
+        evaluate(create_run_folder(tmp_path, preset), (0,), 1, "sampled", jobs=1)
+
+
+def test_one_process_at_a_time_evaluates_a_run(folder: RunFolder) -> None:
+    with Results(folder.evaluation), pytest.raises(AlreadyOwned, match=f"pid {os.getpid()} on"):
+        evaluate(folder, (0,), 1, "greedy", jobs=1)
+    assert len(evaluate(folder, (0,), 1, "greedy", jobs=1)) == 1
+
+
+# The file -------------------------------------------------------------------------------------
+
+
+def episode(number: int, version: int = 0) -> Episode:
+    return Episode(version, "sampled", number, number / 8, success=number % 2 == 0)
+
+
+def test_a_line_that_is_torn_at_any_byte_is_cut_off_and_written_again(tmp_path: Path) -> None:
+    path = tmp_path / "evaluation.jsonl"
+    with Results(path) as results:
+        results.add(episode(0))
+        one_bytes = path.stat().st_size
+        results.add(episode(1))
+    whole = path.read_bytes()
+    for size_bytes in range(one_bytes, len(whole)):
+        path.write_bytes(whole[:size_bytes])
+        assert read_results(path) == [episode(0)]
+        assert path.stat().st_size == size_bytes, "who only reads leaves the file alone"
+        with Results(path) as results:
+            assert list(results.episodes.values()) == [episode(0)]
+            results.add(episode(1))
+        assert path.read_bytes() == whole
+
+
+def test_a_full_disk_leaves_the_file_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "evaluation.jsonl"
+
+    def write_half(file: int, data: bytes, offset: int) -> int:
+        return really_write(file, data[: len(data) // 2], offset)
+
+    really_write = os.pwrite
+    with Results(path) as results:
+        results.add(episode(0))
+        before = path.read_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "pwrite", write_half)
+            with pytest.raises(StorageError, match="No space left on device"):
+                results.add(episode(1))
+        assert path.read_bytes() == before
+        assert episode(1).key not in results.episodes
+        results.add(episode(1))
+    assert read_results(path) == [episode(0), episode(1)]
+
+
+def test_a_score_needs_all_of_its_episodes(tmp_path: Path) -> None:
+    with Results(tmp_path / "evaluation.jsonl") as results:
+        for number in (0, 2):
+            results.add(episode(number))
+        assert results.score(0, "sampled", 3, seed=0) is None
+        results.add(episode(1))
+        score = results.score(0, "sampled", 3, seed=0)
+        assert score is not None
+        assert score.returns == (0.0, 1 / 8, 2 / 8)
+        assert score.success_rate == pytest.approx(2 / 3)
+        assert score.numbers["sampled/return"] == pytest.approx(1 / 8)
+        assert results.score(0, "greedy", 3, seed=0) is None
+    mixed = scores_of([episode(1, version=4), episode(0), episode(0, version=4)], seed=0)
+    assert [(it.version, it.returns) for it in mixed] == [(0, (0.0,)), (4, (0.0, 1 / 8))]
+
+
+# The order ------------------------------------------------------------------------------------
+
+
+def test_the_newest_version_is_scored_first_then_what_is_missing_of_older_ones() -> None:
+    played: dict[Any, Episode] = {}
+    order = []
+    while wanted := next_episode([4, 2], ["sampled", "greedy"], 2, played):
+        order.append(wanted)
+        played[wanted] = Episode(*wanted, 0.0, success=False)
+        if len(order) == 3:
+            break
+    while wanted := next_episode([6, 4, 2], ["sampled", "greedy"], 2, played):
+        order.append(wanted)
+        played[wanted] = Episode(*wanted, 0.0, success=False)
+    assert [version for version, _, _ in order] == [4, 4, 4, 6, 6, 6, 6, 4, 2, 2, 2, 2]
+    assert len(set(order)) == len(order)
+    assert [mode for _, mode, _ in order[3:7]] == ["sampled", "sampled", "greedy", "greedy"]
+
+
+def test_a_lost_simulator_does_not_change_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    preset = load_preset("reaching-smoke")
+    policy = Policy(preset.network, Trainer(preset).weights())
+    expected = Player(preset).play(policy, 0, "sampled", 3)
+    losses = iter(["engine_lost"] * 4)
+
+    def collect_with_losses(*arguments: Any) -> Any:
+        trajectory = collect(*arguments)
+        object.__setattr__(trajectory, "guard", next(losses, None))
+        return trajectory
+
+    collect = evaluation.collect
+    monkeypatch.setattr(evaluation, "collect", collect_with_losses)
+    assert Player(preset).play(policy, 0, "sampled", 3) == expected
+    assert next(losses, None) is None
+    losses = iter(["overstretched"])
+    assert Player(preset).play(policy, 0, "sampled", 3) != expected

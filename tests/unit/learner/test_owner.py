@@ -19,6 +19,7 @@ from broker_config.messages import (
     Command,
     Control,
     Instruction,
+    IterationEnded,
     Refusal,
     SnapshotTaken,
     TicketReply,
@@ -239,3 +240,48 @@ def test_a_pause_outlives_the_owner(journal: Journal) -> None:
     again = own(journal)
     assert again.is_paused
     assert ask(again) is None
+
+
+@pytest.mark.parametrize("process", ["a", None])
+def test_a_drain_outlives_the_owner_until_the_run_is_resumed(
+    journal: Journal, process: str | None
+) -> None:
+    own(journal).control(Control(Command.DRAIN, process), ["a"])
+    again = own(journal)
+    request = TicketRequest("a", "life", "nonce")
+    issued = again.issue(request, 0.0)
+    assert issued is not None
+    assert issued[0].instruction is Instruction.DRAIN
+    again.control(Control(Command.RESUME))
+    resumed = own(journal).issue(request, 0.0)
+    assert resumed is not None
+    assert resumed[0].instruction is Instruction.COLLECT
+
+
+def test_after_its_iteration_a_resend_is_still_recognised(journal: Journal) -> None:
+    owner = own(journal)
+    first = play(ask(owner))
+    before = deliver(owner, first)
+    owner.policy_ready(SnapshotTaken(1, "cd" * 32, 1))
+    later = play(ask(owner, nonce="later"), 1)
+    deliver(owner, later)
+    owner.iteration_ended(IterationEnded(0, "ef" * 32, 0.0, 0.0))
+    for resent, offset in ((first, before.offset), (later, None)):
+        again = deliver(owner, resent)
+        assert (again.verdict, again.duplicate) == (Verdict.ACCEPTED, True)
+        assert offset in (again.offset, None)
+    other = dataclasses.replace(first, id=TrajectoryId("a", "life", 2))
+    assert deliver(owner, other).verdict is Verdict.SPARE, "issued, says the journal, and complete"
+    forged = dataclasses.replace(
+        other, id=TrajectoryId("a", "life", 3), ticket=dataclasses.replace(first.ticket, attempt=5)
+    )
+    assert deliver(owner, forged).verdict is Verdict.UNASKED
+
+
+def test_a_sequence_number_below_the_newest_that_never_arrived_is_new(journal: Journal) -> None:
+    owner = own(journal)
+    sent = play(ask(owner), 7)
+    assert deliver(owner, sent).duplicate is False
+    earlier = dataclasses.replace(sent, id=TrajectoryId("a", "life", 3))
+    assert deliver(owner, earlier).duplicate is False
+    assert deliver(owner, earlier).duplicate is True

@@ -97,3 +97,29 @@ def test_a_pause_holds_questions_back_until_the_resume(
         owner.control(Control(Command.RESUME))
         wait_until(lambda: 0 in answers.by_question, "the answer")
     assert answers.by_question[0].instruction is Instruction.COLLECT
+
+
+def test_actors_that_wait_cost_nothing_while_there_is_nothing_for_them(
+    owner: Owner, wait_until: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actors, changes = 20, 50
+    decided = Counter[str]()
+    issue = owner.issue
+
+    def counted(request: Request, now_secs: float) -> object:
+        decided[request.actor] += 1
+        return issue(request, now_secs)
+
+    monkeypatch.setattr(owner, "issue", counted)
+    answers = Answers()
+    with TicketDesk(owner) as desk:
+        for actor in range(actors):
+            desk.ask(Request(f"a-{actor}", "life", "n"), answers.to(actor))
+        wait_until(lambda: len(decided) == actors, "each is looked at")
+        for _ in range(changes):
+            owner.note_change()
+        owner.policy_ready(SnapshotTaken(0, "ab" * 32, 0))
+        wait_until(lambda: answers.by_question, "one gets the only ticket")
+    assert decided.total() <= 2 * actors
+    given = [it.instruction for it in answers.by_question.values()]
+    assert Counter(given) == {Instruction.COLLECT: 1, Instruction.WAIT: actors - 1}

@@ -1,0 +1,59 @@
+"""Joining a run: what any process asks before it says anything else."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from broker_config.bus import Bus
+from broker_config.codec import SCHEMA_VERSION
+from broker_config.errors import AttachRefused, Refused
+from broker_config.messages import Attach, Role, Welcome
+from broker_config.preset import Preset
+from broker_config.version import VERSION
+
+ATTACH_TIMEOUT_SECS = 3.0
+RETRY_SECS = 0.5
+
+PATIENCE_SECS = 3.0
+"""A refusal is asked again for so long: a killed process of the same name may still seem alive."""
+
+
+def attach(
+    bus: Bus,
+    role: Role,
+    process_id: str,
+    incarnation: str,
+    preset: Preset | None,
+    wait: Callable[[float], bool],
+) -> Welcome:
+    """Asks the run's owner whether this process may join.
+
+    Args:
+        bus: The process's place on the bus.
+        role: As what it joins.
+        process_id: Under which name.
+        incarnation: Of this process; another for every start.
+        preset: What the run must be, or None to take what it is.
+        wait: Pauses for so many seconds, and says whether to give up instead of asking again.
+
+    Raises:
+        AttachRefused: Versions or presets differ, or the name is taken.
+        OwnerUnreachable: There is no owner now; asking again is safe.
+    """
+    request = Attach(
+        role=role,
+        id=process_id,
+        incarnation=incarnation,
+        schema_version=SCHEMA_VERSION,
+        software_version=VERSION,
+        preset_digest=preset.digest if preset else "",
+    )
+    key = bus.keys.attach(role, process_id)
+    give_up_secs = time.monotonic() + PATIENCE_SECS
+    while True:
+        try:
+            return bus.ask(key, request, Welcome, timeout_secs=ATTACH_TIMEOUT_SECS)
+        except Refused as error:
+            if time.monotonic() > give_up_secs or wait(RETRY_SECS):
+                raise AttachRefused(f"run {bus.keys.run}: {error}") from error
