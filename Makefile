@@ -1,12 +1,13 @@
 # make run    set up, then train handkerchief flipping with two actors over an embedded router
 # make test   set up, then run the tests
+# make faults draw the fault matrix of docs/ (about half an hour; goes on where it was)
 # make check  set up, then everything that CI holds: format, lint, types, imports, tests
 
 PYTHON ?= python3.11
 BIN := .venv/bin
 READY := .venv/.ready
 
-.PHONY: run test check bench clean
+.PHONY: run test check bench faults clean
 
 run: $(READY)
 	$(BIN)/clothbus run handkerchief-quickstart --actors 2
@@ -23,6 +24,9 @@ check: $(READY)
 
 bench: $(READY)
 	$(BIN)/pytest tests/benchmarks --override-ini addopts= -s
+
+faults: $(READY)
+	$(BIN)/python -m tests.faults.matrix --output docs/fault_matrix.md
 
 # torch by itself first and exactly: a plain "torch" would bring gigabytes of CUDA libraries.
 $(READY): pyproject.toml constraints.txt

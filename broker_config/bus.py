@@ -8,6 +8,7 @@ decode is counted in `Bus.rejected` and dropped.
 from __future__ import annotations
 
 import atexit
+import logging
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +31,8 @@ from broker_config.quality import reliability, send_options
 from broker_config.queries import Handler, PendingReply, Responder, serve_one
 from broker_config.rejected import Rejected
 from broker_config.session import open_session
+
+_log = logging.getLogger(__name__)
 
 M = TypeVar("M")
 Reply = TypeVar("Reply")
@@ -92,14 +95,28 @@ class Bus(Closing):
         rejected: Counts what did not decode.
     """
 
-    def __init__(self, session: zenoh.Session, run: str, role: Role, process_id: str) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        run: str,
+        role: Role,
+        process_id: str,
+        rejected: Rejected | None = None,
+    ) -> None:
         """Uses an open session, which stays the caller's.
+
+        Args:
+            session: Attached to a router.
+            run: Which run.
+            role: As what.
+            process_id: Under which name.
+            rejected: Counts together with another bus of the process; None counts apart.
 
         Raises:
             MessageError: Run or id cannot be part of a key.
         """
         self.keys = RunKeys(run)
-        self.rejected = Rejected()
+        self.rejected = rejected or Rejected()
         self._live_key = self.keys.live(role, process_id)
         self._session = session
         self._declared: list[Callable[[], None]] = []
@@ -355,6 +372,7 @@ def open_bus(
     role: Role,
     process_id: str,
     overrides: Sequence[str] = (),
+    rejected: Rejected | None = None,
 ) -> Iterator[Bus]:
     """Attaches to a router and closes everything at the end.
 
@@ -364,17 +382,19 @@ def open_bus(
         role: As what.
         process_id: Under which name.
         overrides: Zenoh settings, each `key/path=value`.
+        rejected: Counts together with another bus of the process; None counts apart.
 
     Raises:
         RouterUnreachable: Nobody answers at the address.
         ConfigurationError: An override cannot be used.
         MessageError: Run or id cannot be part of a key.
     """
-    with (
-        open_session("client", address, overrides) as session,
-        Bus(session, run, role, process_id) as bus,
-    ):
-        yield bus
+    session = open_session("client", address, overrides)
+    try:
+        with Bus(session, run, role, process_id, rejected) as bus:
+            yield bus
+    finally:
+        _close(session)
 
 
 def _row_for(key: str, *deliveries: Delivery) -> Row:
@@ -383,6 +403,14 @@ def _row_for(key: str, *deliveries: Delivery) -> Row:
         wanted = " or ".join(deliveries)
         raise MessageError(f"{key}: expected a key for {wanted}; got one for {row.delivery}")
     return row
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        # Somebody has asked for a large answer and does not read it. What counts is acked by now.
+        _log.warning("A connection did not close in order: %s", error)
 
 
 def _closed(subject: str) -> BusError:

@@ -87,6 +87,7 @@ def run_learner(
         take_when_free(lambda: own_run(folder.path)),
         Journal(folder.journal) as journal,
         open_bus(address, folder.run, "owner", "learner", overrides) as bus,
+        open_bus(address, folder.run, "owner", "learner", overrides, bus.rejected) as bulk_bus,
         LearningMetrics(folder.tensorboard) as metrics,
     ):
         owner = Owner(folder.run, preset, journal)
@@ -106,7 +107,7 @@ def run_learner(
             wait_ready,
         )
         LearnerService(
-            bus, "learner", owner, loop, journal, snapshots, metrics, pulse, hung_secs
+            bus, bulk_bus, "learner", owner, loop, journal, snapshots, metrics, pulse, hung_secs
         ).run()
 
 

@@ -60,6 +60,7 @@ class LearnerService:
     def __init__(
         self,
         bus: Bus,
+        bulk_bus: Bus,
         name: str,
         owner: Owner,
         loop: LearningLoop,
@@ -73,6 +74,8 @@ class LearnerService:
 
         Args:
             bus: Its place on the bus.
+            bulk_bus: The same place by a connection of its own, for large answers. Whoever asks for
+                them and does not read them holds up this connection, and not tickets and acks.
             name: Under which it is there.
             owner: Of the run.
             loop: What it does.
@@ -83,6 +86,7 @@ class LearnerService:
             hung_secs: An actor whose main thread gets nowhere for so long loses its tickets.
         """
         self._bus = bus
+        self._bulk_bus = bulk_bus
         self._name = name
         self._owner = owner
         self._loop = loop
@@ -184,8 +188,9 @@ class LearnerService:
         bus.subscribe(keys.every(Kind.LIVE), Heartbeat, self._on_heartbeat)
         bus.serve(keys.every(Kind.ATTACH), Attach, self._on_attach)
         bus.serve(keys.every(Kind.TRAJECTORY), Trajectory, self._on_trajectory)
-        bus.serve(keys.every(Kind.POLICY_VERSION), SnapshotRequest, self._on_snapshot_request)
-        bus.serve(keys.every(Kind.JOURNAL), JournalRequest, self._on_journal_request)
+        bulk = self._bulk_bus
+        bulk.serve(keys.every(Kind.POLICY_VERSION), SnapshotRequest, self._on_snapshot_request)
+        bulk.serve(keys.every(Kind.JOURNAL), JournalRequest, self._on_journal_request)
         bus.serve(keys.control, Control, self._on_control)
 
         bus.serve(

@@ -17,6 +17,21 @@ from broker_config.messages import AttemptEnded, Trajectory, Verdict
 Step = tuple[int, float, str]
 """Action, reward, digest of the picture."""
 
+Episode = tuple[str, int]
+"""Incarnation of the actor, and its count of episodes."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """What environments played, beside what was journalled of it."""
+
+    played: dict[Episode, list[Step]]
+    missing: Counter[Episode]
+    """Steps of each episode that are not in the journal; 0 for most."""
+    journalled: int
+    strangers: list[str]
+    """Journalled trajectories without an episode of their own: doubles, and what nobody played."""
+
 
 @dataclass(frozen=True)
 class Account:
@@ -39,29 +54,39 @@ def settle(step_log: Path, journal_path: Path) -> Account:
     Raises:
         AssertionError: The journal has a trajectory that no environment played, or one twice.
     """
+    with JournalReader(journal_path) as journal:
+        match = match_episodes(step_log, journal)
+        assert not match.strangers, match.strangers
+        accepted, learned = _accepted(journal)
+    acted = sum(map(len, match.played.values()))
+    return Account(acted, match.journalled, match.missing.total(), learned, accepted)
+
+
+def match_episodes(step_log: Path, journal: JournalReader) -> Match:
+    """Finds the episode of each journalled trajectory; an episode is found once."""
     played = _played(step_log)
-    remaining = Counter({episode: len(steps) for episode, steps in played.items()})
-    acted = sum(remaining.values())
-    by_start: defaultdict[tuple[str, Step], list[tuple[str, int]]] = defaultdict(list)
+    missing = Counter({episode: len(steps) for episode, steps in played.items()})
+    by_start: defaultdict[tuple[str, Step], list[Episode]] = defaultdict(list)
     for episode, steps in played.items():
         by_start[episode[0], steps[0]].append(episode)
-    journalled = 0
-    with JournalReader(journal_path) as journal:
-        for entry in journal.entries(prefix="trajectory/"):
-            trajectory = decode(entry.payload, Trajectory)
-            assert encode(trajectory) == entry.payload
-            steps = _steps(trajectory)
-            candidates = by_start[trajectory.id.incarnation, steps[0]]
-            match = next(it for it in candidates if played[it][: len(steps)] == steps)
-            candidates.remove(match)  # a second trajectory of the same episode finds none
-            remaining[match] -= len(steps)
-            journalled += len(steps)
-        accepted, learned = _accepted(journal)
-    return Account(acted, journalled, sum(remaining.values()), learned, accepted)
+    journalled, strangers = 0, []
+    for entry in journal.entries(prefix="trajectory/"):
+        trajectory = decode(entry.payload, Trajectory)
+        assert encode(trajectory) == entry.payload
+        steps = _steps(trajectory)
+        journalled += len(steps)
+        candidates = by_start[trajectory.id.incarnation, steps[0]]
+        found = next((it for it in candidates if played[it][: len(steps)] == steps), None)
+        if found is None:
+            strangers.append(entry.name)
+        else:
+            candidates.remove(found)  # a second trajectory of the same episode finds none
+            missing[found] -= len(steps)
+    return Match(played, missing, journalled, strangers)
 
 
-def _played(step_log: Path) -> dict[tuple[str, int], list[Step]]:
-    episodes: defaultdict[tuple[str, int], list[Step]] = defaultdict(list)
+def _played(step_log: Path) -> dict[Episode, list[Step]]:
+    episodes: defaultdict[Episode, list[Step]] = defaultdict(list)
     for text in step_log.read_text().splitlines():
         line = json.loads(text)
         steps = episodes[line["incarnation"], line["episode"]]

@@ -82,6 +82,14 @@ def wait_for_file(path: Path, command: Command) -> str:
     return path.read_text().strip()
 
 
+def wait_for_lines(path: Path, count: int) -> None:
+    """Waits until a log has so many lines."""
+    deadline = time.monotonic() + START_SECS
+    while not path.exists() or path.read_bytes().count(b"\n") < count:
+        assert time.monotonic() < deadline, f"waited for {count} lines in {path}"
+        time.sleep(0.002)
+
+
 def wait_for_trajectories(folder: Path, count: int, timeout_secs: float = 90.0) -> None:
     """Waits until the journal holds so many trajectories."""
     deadline = time.monotonic() + timeout_secs

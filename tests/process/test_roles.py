@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
 
 from broker_config.journal import JOURNAL_FILE
 from tests.process.accounting import settle
-from tests.process.conftest import Start, trajectories, wait_for_file, wait_for_trajectories
+from tests.process.conftest import (
+    Start,
+    trajectories,
+    wait_for_file,
+    wait_for_lines,
+    wait_for_trajectories,
+)
 
 HORIZON = 150
 SETTINGS = (
@@ -20,14 +25,6 @@ SETTINGS = (
     "schedule.iterations=3",
 )
 RUN_SECS = 150.0
-
-
-def wait_for_lines(path: Path, count: int) -> None:
-    """Waits until a log has so many lines."""
-    deadline = time.monotonic() + 60
-    while not path.exists() or path.read_bytes().count(b"\n") < count:
-        assert time.monotonic() < deadline, f"waited for {count} lines in {path}"
-        time.sleep(0.002)
 
 
 @pytest.mark.timeout(400)

@@ -1,0 +1,156 @@
+"""Draws the tables of docs/delivery.md from the newest results of each benchmark.
+
+python -m tests.benchmarks.tables build/bench/results.jsonl
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.measuring import RESULTS
+
+PAGE = Path("docs/delivery.md")
+Line = dict[str, Any]
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def made_by(lines: Sequence[Line], form: str) -> str:
+    """What a reader must know of the run."""
+    newest = lines[-1]
+    return (
+        f"\n\n{form}, {newest['at'][:10]}, {newest['machine']}; "
+        f"load average of 15 minutes: {newest['load_15_min']:.1f}."
+    )
+
+
+def losses(lines: Sequence[Line]) -> str:
+    """Sent, lost and double, by accident and system."""
+    counts = lines[-1]["counts"]
+    rows = [
+        [it["accident"], it["system"], it["sent"], it["arrived"], it["lost"], it["double"]]
+        for it in counts
+    ]
+    head = ["accident", "over", "handed over", "arrived", "lost", "double"]
+    form = f"{counts[0]['sent']} messages, {lines[-1]['rate']:.0f} a second"
+    return table(head, rows) + made_by(lines, form)
+
+
+def delivery_load(lines: Sequence[Line]) -> str:
+    """Rates and times of each round of the newest command."""
+    first = max(number for number, line in enumerate(lines) if line["round"] == 0)
+    rounds = lines[first:]
+    rows = [
+        ["episodes a second, clothbus: acked", *_each(rounds, "clothbus", "acked_per_sec")],
+        ["calls a second, Ray: carried", *_each(rounds, "ray", "per_sec")],
+        ["calls a second, gRPC: carried", *_each(rounds, "grpc", "per_sec")],
+        ["clothbus: ms from last step to ack, p50", *_each(rounds, "clothbus", "ms_to_ack_p50")],
+        ["clothbus: ms from last step to ack, p99", *_each(rounds, "clothbus", "ms_to_ack_p99")],
+        ["Ray: ms to the reply, p50", *_each(rounds, "ray", "ms_to_reply_p50")],
+        ["Ray: ms to the reply, p99", *_each(rounds, "ray", "ms_to_reply_p99")],
+        ["gRPC: ms to the reply, p50", *_each(rounds, "grpc", "ms_to_reply_p50")],
+        ["gRPC: ms to the reply, p99", *_each(rounds, "grpc", "ms_to_reply_p99")],
+        *_policy_rows(rounds),
+        ["bytes of a transition", *_each(rounds, "clothbus", "payload_bytes_per_transition")],
+        ["the same on the wire", *_each(rounds, "clothbus", "wire_bytes_per_transition")],
+    ]  # fmt: skip
+    head = ["", *(f"round {number + 1}" for number in range(len(rounds)))]
+    return table(head, rows) + made_by(rounds, f"{rounds[0]['clothbus']['episodes']} episodes")
+
+
+def _policy_rows(rounds: Sequence[Line]) -> list[list[object]]:
+    names = {
+        "ms from a policy's publication to its first use": "ms_to_first_action_on_a_policy",
+        "ms, age of the policy at an episode's start": "policy_age_ms",
+        "versions behind the newest": "policy_versions_behind",
+    }  # fmt: skip
+    return [
+        [f"{text}, {share}", *_each(rounds, "clothbus", f"{name}_{share}")]
+        for text, name in names.items()
+        for share in ("p50", "p99")
+    ]
+
+
+def _each(rounds: Sequence[Line], system: str, name: str) -> list[object]:
+    return [line[system].get(name, "not installed") for line in rounds]
+
+
+def light_actors(lines: Sequence[Line]) -> str:
+    """Ingest and memory."""
+    it = lines[-1]
+    rows: list[list[object]] = [
+        ["trajectories a second", it["trajectories_per_sec"]],
+        ["MB a second", it["mb_per_sec"]],
+        ["trajectories in all", it["trajectories"]],
+        ["of these spare (an actor seemed silent for 5 s)", it["spare"]],
+        ["processor share of the learner, in cores", it["cpu_share"]["learner"]],
+        ["processor share of the router, in cores", it["cpu_share"]["router"]],
+    ]
+    for name, mib in it["memory"].items():
+        rows.append([f"{name}: MiB after the first fifth", mib["begin"]])
+        rows.append([f"{name}: MiB at the end", mib["end"]])
+        rows.append([f"{name}: MiB at most", mib["most"]])
+    form = f"{it['actors']} actors, {it['secs']:.0f} s"
+    return table(["", "figure"], rows) + made_by(lines, form)
+
+
+def recording_load(lines: Sequence[Line]) -> str:
+    """The recorder's lag, and what it holds."""
+    it = lines[-1]
+    rows = [
+        ["messages a second", it["messages_per_sec"]],
+        ["journal entries recorded", it["journal_entries_recorded"]],
+        ["journal entries lost or double", it["journal_entries_lost"]],
+        ["lag p50, ms", it["lag_ms_p50"]],
+        ["lag p99, ms", it["lag_ms_p99"]],
+        ["from the kill until the lag is below 1 s again, s", it["secs_to_catch_up_after_kill"]],
+        ["policies trained meanwhile, all recorded", it["policies"]],
+        ["views sent, best effort", it["views_sent"]],
+        ["views recorded", it["views_recorded"]],
+    ]
+    return table(["", "figure"], rows) + made_by(lines, f"{it['secs']:.0f} s")
+
+
+def ingest_costs(lines: Sequence[Line]) -> str:
+    """Processor time of each step of ingest."""
+    it = lines[-1]
+    rows = [[name, f"{secs * 1e3:.2f}"] for name, secs in it["cpu_secs_each"].items()]
+    return table(["step", "ms"], rows) + made_by(lines, f"{it['trajectories']} trajectories")
+
+
+DRAWN: dict[str, Callable[[Sequence[Line]], str]] = {
+    "losses": losses,
+    "delivery_load": delivery_load,
+    "light_actors": light_actors,
+    "recording_load": recording_load,
+    "ingest_costs": ingest_costs,
+}
+
+
+def main() -> None:
+    results = Path(sys.argv[1]) if len(sys.argv) > 1 else RESULTS
+    lines = [json.loads(text) for text in results.read_text().splitlines()]
+    page = PAGE.read_text()
+    for name, draw in DRAWN.items():
+        mine = [line for line in lines if line["benchmark"] == name]
+        if mine:
+            begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+            block = f"{begin}\n{draw(mine)}\n{end}"
+            page, count = re.subn(
+                f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, b=block: b, page, flags=re.S
+            )
+            assert count == 1, f"{PAGE} has {count} places for {name}"
+    PAGE.write_text(page)
+
+
+if __name__ == "__main__":
+    main()
