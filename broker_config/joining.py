@@ -1,4 +1,4 @@
-"""Joining a run: what any process asks before it says anything else."""
+"""Joining a run: what any process asks before it says anything else, and when the owner says no."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from broker_config.bus import Bus
 from broker_config.codec import SCHEMA_VERSION
 from broker_config.errors import AttachRefused, Refused
-from broker_config.messages import Attach, Role, Welcome
+from broker_config.messages import Attach, Refusal, Role, Welcome
 from broker_config.preset import Preset
 from broker_config.version import VERSION
 
@@ -57,3 +57,17 @@ def attach(
         except Refused as error:
             if time.monotonic() > give_up_secs or wait(RETRY_SECS):
                 raise AttachRefused(f"run {bus.keys.run}: {error}") from error
+
+
+def refusal(request: Attach, preset: Preset) -> Refusal | None:
+    """Why a process must not join a run of this preset; None if it may."""
+    if request.schema_version != SCHEMA_VERSION:
+        rule = "schema version", str(SCHEMA_VERSION), str(request.schema_version)
+    elif request.software_version != VERSION:
+        rule = "clothbus version", VERSION, request.software_version
+    elif request.preset_digest not in ("", preset.digest):
+        advice = f"start {request.id} without a preset: it then takes the run's"
+        return Refusal("preset digest", preset.digest, request.preset_digest, advice)
+    else:
+        return None
+    return Refusal(*rule, "install the same clothbus version on both machines")

@@ -26,8 +26,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
 
-from broker_config.codec import SCHEMA_VERSION, decode, decode_any, encode
+from broker_config.codec import decode, decode_any, encode
 from broker_config.errors import ClothbusError, StorageError
+from broker_config.joining import refusal
 from broker_config.journal import Appended, Journal
 from broker_config.messages import (
     Ack,
@@ -50,14 +51,15 @@ from broker_config.messages import (
     TicketRequest,
     TicketReseeded,
     Trajectory,
-    TrajectoryId,
     Verdict,
     Welcome,
 )
 from broker_config.preset import Preset
 from broker_config.version import VERSION
+from learner.arrivals import Arrivals
 from learner.followers import Followers
 from learner.recorded import trajectory_name
+from learner.steering import Steering, spelled_out
 from learner.tickets import TicketBook, TicketEvent
 
 _log = logging.getLogger(__name__)
@@ -86,14 +88,9 @@ class Owner:
         self.changes = 0
         self._journal = journal
         self._book = TicketBook(preset, self._issued_before)
-        self._uncommitted: dict[TrajectoryId, Verdict] = {}
-        """Trajectories on their way to the disk; all others are looked up in the journal."""
-        self._newest: dict[tuple[str, str], int] = {}
-        """Highest sequence number by actor and incarnation: what is above it never arrived."""
+        self._arrivals = Arrivals(journal)
         self._latest_version = -1
-        self._paused = False
-        self._stopping = False
-        self._draining: set[str] = set()
+        self._steering = Steering()
         self._controls = 0
         self._joins = 0
         self._is_over = False
@@ -114,20 +111,8 @@ class Owner:
 
     def attach(self, request: Attach) -> Welcome | Refusal:
         """Lets a process join if it speaks the same contract about the same preset."""
-        rules = [
-            ("schema version", str(SCHEMA_VERSION), str(request.schema_version)),
-            ("clothbus version", VERSION, request.software_version),
-        ]
-        if request.preset_digest:
-            rules.append(("preset digest", self.preset.digest, request.preset_digest))
-        for subject, expected, got in rules:
-            if expected != got:
-                advice = (
-                    f"start {request.id} without a preset: it then takes the run's"
-                    if subject == "preset digest"
-                    else "install the same clothbus version on both machines"
-                )
-                return Refusal(subject, expected, got, advice)
+        if (no := refusal(request, self.preset)) is not None:
+            return no
         return Welcome(self.run, self.epoch, self.preset.to_json())
 
     # Tickets ----------------------------------------------------------------------------------
@@ -149,7 +134,7 @@ class Owner:
             if (repeated := self._book.repeated(request)) is not None:
                 self._book.heard(request.actor, request.incarnation, now_secs)
                 return self._reply(request, Instruction.COLLECT, repeated), _nothing_to_commit()
-            if self._paused:
+            if self._steering.is_paused:
                 return None
             ticket, events = self._book.issue(request, self._latest_version, now_secs)
             future = self._append_events(events)
@@ -158,9 +143,7 @@ class Owner:
             return self._reply(request, Instruction.COLLECT, ticket), future
 
     def _farewell(self, actor: str) -> Instruction | None:
-        if self._book.all_complete or self._stopping:
-            return Instruction.STOP
-        return Instruction.DRAIN if actor in self._draining else None
+        return Instruction.STOP if self._book.all_complete else self._steering.farewell(actor)
 
     def _reply(
         self, request: TicketRequest, instruction: Instruction, ticket: Ticket | None = None
@@ -176,7 +159,7 @@ class Owner:
         with self.changed:
             if self._failure is not None or self._farewell(actor) is not None:
                 return True
-            return not self._paused and self._book.may_issue(self._latest_version)
+            return not self._steering.is_paused and self._book.may_issue(self._latest_version)
 
     def heard(self, actor: str, incarnation: str, now_secs: float) -> None:
         """Renews an actor's leases."""
@@ -208,12 +191,11 @@ class Owner:
         with self.changed:
             self._require_sound()
             self._require_going_on()
-            known = self._verdict(trajectory.id)
+            known = self._arrivals.verdict(trajectory.id)
             events = [] if known else self._book.close(trajectory)
             verdict = known or _verdict_in(events)
             if not known:
-                self._uncommitted[trajectory.id] = verdict
-                self._note_arrival(trajectory.id)
+                self._arrivals.arrived(trajectory.id, verdict)
             appended = self._append_events(events, (trajectory_name(trajectory.id), payload))
         ack: Future[Ack] = Future()
 
@@ -223,26 +205,13 @@ class Owner:
                 return
             stored = done.result()[0]
             with self.changed:
-                self._uncommitted.pop(trajectory.id, None)
+                self._arrivals.committed(trajectory.id)
                 self.note_change()
             is_duplicate = not stored.is_new
             ack.set_result(Ack(trajectory.id, self.epoch, stored.offset, verdict, is_duplicate))
 
         appended.add_done_callback(acknowledge)
         return ack
-
-    def _verdict(self, trajectory: TrajectoryId) -> Verdict | None:
-        """What became of a trajectory, or None if it never arrived."""
-        if trajectory.sequence > self._newest.get(_process_of(trajectory), -1):
-            return None
-        if (verdict := self._uncommitted.get(trajectory)) is not None:
-            return verdict
-        entry = self._journal.find(f"ended/{trajectory}")
-        return None if entry is None else decode(entry.payload, AttemptEnded).verdict
-
-    def _note_arrival(self, trajectory: TrajectoryId) -> None:
-        process = _process_of(trajectory)
-        self._newest[process] = max(trajectory.sequence, self._newest.get(process, -1))
 
     def _issued_before(self, index: int, attempt: int) -> TicketIssued | None:
         entry = self._journal.find(f"ticket/{index}/{attempt}")
@@ -264,18 +233,18 @@ class Owner:
     @property
     def is_paused(self) -> bool:
         """Whether tickets are held back until a `resume`."""
-        return self._paused
+        return self._steering.is_paused
 
     @property
     def is_stopping(self) -> bool:
         """Whether the run was asked to stop before its end."""
-        return self._stopping
+        return self._steering.is_stopping
 
     def is_ready(self, index: int) -> bool:
         """Whether ticket `index` is complete and durable."""
         with self.changed:
             is_complete = self._book.is_complete(index)
-            return is_complete and self._uncommitted.keys().isdisjoint(self._book.parts(index))
+            return is_complete and self._arrivals.are_durable(self._book.parts(index))
 
     def wait_ready(self, index: int, timeout_secs: float) -> bool:
         """Waits until ticket `index` is complete and durable, or the time or the run is over.
@@ -285,7 +254,7 @@ class Owner:
         """
         with self.changed:
             self.changed.wait_for(
-                lambda: self.is_ready(index) or self._stopping or self._failure, timeout_secs
+                lambda: self.is_ready(index) or self.is_stopping or self._failure, timeout_secs
             )
             self._require_sound()
             return self.is_ready(index)
@@ -391,40 +360,29 @@ class Owner:
         """
         with self.changed:
             self._require_sound()
-            future = self._append(*self._numbered(control, actors))
-            self._apply_control(control, actors)
+            orders = spelled_out(control, actors)
+            first = self._controls + 1
+            self._controls += len(orders)
+            future = self._append(
+                *((f"control/{self.epoch}/{n}", order) for n, order in enumerate(orders, first))
+            )
+            for order in orders:
+                self._apply_control(order)
             self.note_change()
-            state = "stopping" if self._stopping else "paused" if self._paused else "running"
+            state = self._steering.state
         future.result()
         return ControlReply(control.command, state)
-
-    def _numbered(self, control: Control, actors: Iterable[str]) -> list[tuple[str, Control]]:
-        """The entries of a command; who was there is part of the record of a `drain` of all."""
-        named = [control]
-        if control.command is Command.DRAIN and control.process is None:
-            named += [Control(Command.DRAIN, actor) for actor in actors]
-        first, self._controls = self._controls + 1, self._controls + len(named)
-        return [(f"control/{self.epoch}/{n}", item) for n, item in enumerate(named, first)]
 
     def stop(self) -> None:
         """Ends the run early: actors are told, `wait_ready` returns."""
         with self.changed:
-            self._stopping = True
+            self._steering.is_stopping = True
             self.note_change()
 
-    def _apply_control(self, control: Control, actors: Iterable[str]) -> None:
-        match control.command:
-            case Command.PAUSE:
-                self._paused = True
-            case Command.RESUME:
-                self._paused = False
-                self._draining.clear()
-            case Command.DRAIN:
-                self._draining.update([control.process] if control.process else actors)
-            case Command.FORGET:
-                self.followers.forget(control.process)
-            case Command.STOP:
-                self._stopping = True
+    def _apply_control(self, control: Control) -> None:
+        self._steering.apply(control)
+        if control.command is Command.FORGET:
+            self.followers.forget(control.process)
 
     # The journal ------------------------------------------------------------------------------
 
@@ -484,9 +442,9 @@ class Owner:
                 case TicketIssued() | AttemptEnded() | TicketReseeded() as event:
                     self._book.apply(event)
                     if isinstance(event, AttemptEnded) and event.trajectory is not None:
-                        self._note_arrival(event.trajectory)
+                        self._arrivals.committed(event.trajectory)
                 case Control() as control if control.command is not Command.STOP:
-                    self._apply_control(control, ())
+                    self._apply_control(control)
                 case FollowerJoined() as joined:
                     self.followers.apply(joined)
                 case SnapshotTaken() as snapshot:
@@ -499,10 +457,6 @@ class Owner:
                 f"journal: expected preset {self.preset.name} ({self.preset.digest[:12]}); "
                 "got a run of another preset; resume it with its own, or choose another run folder"
             )
-
-
-def _process_of(trajectory: TrajectoryId) -> tuple[str, str]:
-    return trajectory.actor, trajectory.incarnation
 
 
 def _verdict_in(events: Sequence[TicketEvent]) -> Verdict:
