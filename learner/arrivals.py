@@ -6,7 +6,10 @@ from collections.abc import Iterable
 
 from broker_config.codec import decode
 from broker_config.journal import JournalReader
-from broker_config.messages import AttemptEnded, TrajectoryId, Verdict
+from broker_config.messages import AttemptEnded, Trajectory, TrajectoryId, Verdict
+
+RECEIVED_BYTES = 64 << 20
+"""Of pictures that are kept decoded; the learner absorbs most episodes as they come."""
 
 
 class Arrivals:
@@ -44,3 +47,29 @@ class Arrivals:
     def _note_newest(self, trajectory: TrajectoryId) -> None:
         process = trajectory.actor, trajectory.incarnation
         self._newest[process] = max(trajectory.sequence, self._newest.get(process, -1))
+
+
+class Received:
+    """Trajectories as they were decoded, until they are learned from; the oldest make way.
+
+    What is not here is in the journal: this only saves reading and decoding it again.
+    """
+
+    def __init__(self, most_bytes: int = RECEIVED_BYTES) -> None:
+        self._most_bytes = most_bytes
+        self._bytes = 0
+        self._trajectories: dict[TrajectoryId, Trajectory] = {}
+
+    def put(self, trajectory: Trajectory) -> None:
+        """Keeps one for a while."""
+        self._trajectories[trajectory.id] = trajectory
+        self._bytes += trajectory.observations.nbytes
+        while self._bytes > self._most_bytes:
+            self.take(next(iter(self._trajectories)))
+
+    def take(self, trajectory: TrajectoryId) -> Trajectory | None:
+        """Gives one away, if it is still here."""
+        found = self._trajectories.pop(trajectory, None)
+        if found is not None:
+            self._bytes -= found.observations.nbytes
+        return found

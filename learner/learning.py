@@ -59,6 +59,20 @@ class EpisodeAbsorbed:
     """Updates made since the version on which the episode acted."""
 
 
+@dataclass(frozen=True)
+class _Outcome:
+    """What an iteration's record needs of an episode."""
+
+    ids: tuple[str, ...]
+    return_: float
+    success: bool
+
+
+def _outcome_of(parts: Sequence[Trajectory]) -> _Outcome:
+    ids = tuple(str(part.id) for part in parts)
+    return _Outcome(ids, sum(part.return_ for part in parts), parts[-1].success)
+
+
 class LearningLoop:
     """Iterating over it runs the learner; statistics and publishing stay with the caller."""
 
@@ -92,6 +106,8 @@ class LearningLoop:
         self._absorbed = 0
         self._version = 0
         self._report: UpdateReport | None = None
+        self._outcomes: dict[int, _Outcome] = {}
+        """Of this iteration's episodes, as far as this process has absorbed them."""
 
     def __iter__(self) -> Iterator[PolicyReady | EpisodeAbsorbed]:
         """Yields what happens until the run is complete or was stopped."""
@@ -161,12 +177,13 @@ class LearningLoop:
         parts = self._owner.trajectories(index)
         for part in parts:
             self._add(part, part.steps)
+        outcome = self._outcomes[index] = _outcome_of(parts)
         self._absorbed += 1
         return EpisodeAbsorbed(
             index=index,
             iteration=index // self._schedule.episodes_per_iteration,
-            return_=sum(part.return_ for part in parts),
-            success=parts[-1].success,
+            return_=outcome.return_,
+            success=outcome.success,
             steps=sum(part.steps for part in parts),
             policy_lag=self._version - parts[0].ticket.policy_version,
         )
@@ -214,13 +231,16 @@ class LearningLoop:
     def _iteration(self, number: int) -> IterationEnded:
         per_iteration = self._schedule.episodes_per_iteration
         tickets = range(number * per_iteration, (number + 1) * per_iteration)
-        episodes = [self._owner.trajectories(index) for index in tickets]
-        ids = "\n".join(str(part.id) for episode in episodes for part in episode)
-        returns = [sum(part.return_ for part in episode) for episode in episodes]
-        successes = [episode[-1].success for episode in episodes]
+        episodes = [
+            self._outcomes.pop(index)
+            if index in self._outcomes
+            else _outcome_of(self._owner.trajectories(index))
+            for index in tickets
+        ]
+        ids = "\n".join(id_ for episode in episodes for id_ in episode.ids)
         return IterationEnded(
             number,
             hashlib.sha256(ids.encode()).hexdigest(),
-            float(np.mean(returns)),
-            float(np.mean(successes)),
+            float(np.mean([episode.return_ for episode in episodes])),
+            float(np.mean([episode.success for episode in episodes])),
         )

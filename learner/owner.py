@@ -51,12 +51,13 @@ from broker_config.messages import (
     TicketRequest,
     TicketReseeded,
     Trajectory,
+    TrajectoryId,
     Verdict,
     Welcome,
 )
 from broker_config.preset import Preset
 from broker_config.version import VERSION
-from learner.arrivals import Arrivals
+from learner.arrivals import Arrivals, Received
 from learner.followers import Followers
 from learner.recorded import trajectory_name
 from learner.steering import Steering, spelled_out
@@ -89,6 +90,7 @@ class Owner:
         self._journal = journal
         self._book = TicketBook(preset, self._issued_before)
         self._arrivals = Arrivals(journal)
+        self._received = Received()
         self._latest_version = -1
         self._steering = Steering()
         self._controls = 0
@@ -196,6 +198,8 @@ class Owner:
             verdict = known or _verdict_in(events)
             if not known:
                 self._arrivals.arrived(trajectory.id, verdict)
+            if verdict is Verdict.ACCEPTED and not known:
+                self._received.put(trajectory)
             appended = self._append_events(events, (trajectory_name(trajectory.id), payload))
         ack: Future[Ack] = Future()
 
@@ -260,14 +264,19 @@ class Owner:
             return self.is_ready(index)
 
     def trajectories(self, index: int) -> list[Trajectory]:
-        """The accepted parts of a complete ticket, from the journal."""
-        found = []
-        for part in self._book.parts(index):
-            entry = self._journal.find(trajectory_name(part))
-            if entry is None:
-                raise StorageError(f"journal: expected trajectory {part}; it is not there")
-            found.append(decode(entry.payload, Trajectory))
-        return found
+        """The accepted parts of a complete ticket, as they are in the journal."""
+        with self.changed:
+            parts = self._book.parts(index)
+            received = [self._received.take(part) for part in parts]
+        return [
+            kept or self._read_trajectory(part) for part, kept in zip(parts, received, strict=True)
+        ]
+
+    def _read_trajectory(self, id_: TrajectoryId) -> Trajectory:
+        entry = self._journal.find(trajectory_name(id_))
+        if entry is None:
+            raise StorageError(f"journal: expected trajectory {id_}; it is not there")
+        return decode(entry.payload, Trajectory)
 
     def demonstrations(self) -> list[Trajectory]:
         """What was given to `keep_demonstrations`, in any epoch."""
