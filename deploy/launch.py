@@ -205,7 +205,13 @@ class Supervisor:
         if code == UNREACHABLE_EXIT:  # the router may be on its way back, if it was ever there
             return not self._signs.has_heard()
         was_ended = code in (-signal.SIGKILL, -signal.SIGTERM, TERMINATED_EXIT)
-        return not (was_ended and self._signs.was_heard(supervised.as_living()))
+        return not (was_ended and self._has_worked(supervised))
+
+    def _has_worked(self, supervised: Supervised) -> bool:
+        """Whether a process got anywhere before it ended. A router is heard by what it carries."""
+        if supervised.spec.role == "router":
+            return self._signs.has_heard(supervised.started_secs)
+        return self._signs.was_heard(supervised.as_living())
 
     def _restart_when_due(self, supervised: Supervised) -> None:
         if supervised.restart_at_secs is None or time.monotonic() < supervised.restart_at_secs:

@@ -78,10 +78,10 @@ class VitalSigns:
         """Whether a process has ever sent a heartbeat."""
         return process.pid in self._signs_of([process])
 
-    def has_heard(self) -> bool:
-        """Whether anybody has."""
+    def has_heard(self, since_secs: float = 0.0) -> bool:
+        """Whether anybody has, since a moment of the monotonic clock."""
         with self._lock:
-            return bool(self._signs)
+            return any(sign.heard_secs >= since_secs for sign in self._signs.values())
 
     def judge(self, living: Sequence[Living]) -> list[Hang]:
         """Tells which of these processes hang; call it several times a second."""

@@ -131,10 +131,10 @@ def disturb(
         run.wait_steady()
         while faults and run.is_young():
             time.sleep(dice.uniform(0.0, LONGEST_PAUSE_SECS))  # the moment is random
-            chosen = next((it for it in reversed(faults) if run.is_ready_for(it)), None)
-            if chosen is not None:
-                faults.remove(chosen)
-                on_healed(run.do(chosen, dice))
+            # By its place: of equal faults, `remove` would take the first and leave this one last.
+            ready = [place for place, cell in enumerate(faults) if run.is_ready_for(cell)]
+            if ready:
+                on_healed(run.do(faults.pop(ready[-1]), dice))
                 run.wait_steady()
         return run.finish()
 

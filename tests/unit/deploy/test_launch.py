@@ -109,6 +109,27 @@ def test_a_process_that_is_killed_often_but_gets_somewhere_is_kept_alive(
             wait_for(lambda life=life: process.restarts == life, supervisor, "a restart")
 
 
+def test_a_router_that_is_killed_often_but_carries_heartbeats_is_kept_alive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("deploy.launch.PAUSES_SECS", (0.0,))
+    signs = VitalSigns()
+    with Supervisor(tmp_path, signs) as supervisor:
+        process = supervisor.start(Script("router", "router", (), FOREVER))
+        for life in range(1, SHORT_LIVES_BEFORE_GIVING_UP + 2):
+            beat(signs, 1)  # another process's, by way of the router
+            assert process.process is not None
+            process.process.kill()
+            wait_for(lambda life=life: process.restarts == life, supervisor, "a restart")
+        for _ in range(SHORT_LIVES_BEFORE_GIVING_UP - 1):
+            restarts = process.restarts
+            process.process.kill()
+            wait_for(lambda n=restarts: process.restarts > n, supervisor, "a restart")
+        process.process.kill()
+        with pytest.raises(ProcessFailed, match="router ended with code -9"):
+            wait_for(lambda: False, supervisor, "nothing was heard through any of these")
+
+
 def test_a_router_that_is_away_for_a_while_does_not_end_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
