@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from mcap.records import Channel, Message, Schema
 
+from broker_config.closing import Closing
 from broker_config.codec import decode_any, encode
 from broker_config.errors import ClothbusError, SchemaMismatch, StorageError
 from broker_config.failpoints import Failpoint, reach
@@ -71,7 +70,7 @@ def lock_recording(folder: Path) -> FileLock:
     return FileLock(folder / LOCK_FILE, f"recording {folder}")
 
 
-class Recording:
+class Recording(Closing):
     """Writes the recording of one run; for one thread.
 
     Whoever opens it has locked the folder. After an `OSError` it can only be closed; opening it
@@ -206,17 +205,6 @@ class Recording:
     def close(self) -> None:
         """Closes the file as it is; a segment that is not finished is mended by the next start."""
         self._segment.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _begin(self, number: int) -> None:
         self._segment_facts = Facts()

@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from actors.cloth.guard import GuardReason
 from actors.policy import Policy
 from actors.rollout import collect
 from actors.task import make_task_env
+from broker_config.closing import Closing
 from broker_config.errors import StorageError
 from broker_config.messages import Ticket, Trajectory, TrajectoryId
 from broker_config.ownership import FileLock
@@ -159,7 +160,7 @@ class Player:
 # Keeping --------------------------------------------------------------------------------------
 
 
-class Results:
+class Results(Closing):
     """The file of evaluation episodes, one JSON line each; one process at a time may add to it.
 
     Attributes:
@@ -214,12 +215,6 @@ class Results:
         """Gives the file free."""
         os.close(self._file)
         self._lock.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _unwritable(self, error: OSError) -> StorageError:
         return StorageError(
