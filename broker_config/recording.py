@@ -14,6 +14,7 @@ from mcap.records import Channel, Message, Schema
 
 from broker_config.closing import Closing
 from broker_config.codec import decode_any, encode
+from broker_config.durable import PARTIAL_SUFFIX, sync_folder
 from broker_config.errors import ClothbusError, SchemaMismatch, StorageError
 from broker_config.failpoints import Failpoint, reach
 from broker_config.messages import (
@@ -50,14 +51,13 @@ from broker_config.recording_reader import (
     read_facts,
     scan_torn,
 )
-from broker_config.recording_segment import SegmentWriter, sync_folder, to_ns
+from broker_config.recording_segment import SegmentWriter, to_ns
 from broker_config.version import VERSION
 
 __all__ = ["RecordedMessage", "Recording", "iter_recording", "lock_recording"]
 
 SEGMENT_BYTES = 1 << 30
 LOCK_FILE = "recorder.lock"
-PARTIAL_SUFFIX = ".partial"
 
 
 def lock_recording(folder: Path) -> FileLock:

@@ -12,6 +12,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from broker_config.codec import SCHEMA_VERSION
+from broker_config.durable import sync_folder
 from broker_config.messages import View
 from broker_config.recording_format import MESSAGE_ENCODING, PROFILE, Facts
 from broker_config.version import VERSION
@@ -213,16 +214,3 @@ class SegmentWriter:
 def to_ns(unix_secs: float) -> int:
     """A wall clock's time as MCAP holds it; what lies before 1970 or after 2500 is cut off."""
     return round(min(max(unix_secs, 0.0), 16.7e9) * _NS_PER_SEC)
-
-
-def sync_folder(folder: Path) -> None:
-    """Makes names in a folder durable: files that were made or renamed.
-
-    Raises:
-        OSError: The disk refuses.
-    """
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -20,8 +20,8 @@ import safetensors
 import safetensors.torch
 from torch import Tensor
 
+from broker_config.durable import PARTIAL_SUFFIX, write_durably
 from broker_config.errors import StorageError
-from learner.durable import PARTIAL_SUFFIX, write_durably
 from learner.trainer import TrainerState
 
 _log = logging.getLogger(__name__)

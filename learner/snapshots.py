@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from broker_config.durable import write_durably
 from broker_config.errors import StorageError
-from learner.durable import write_durably
 
 _NAME = re.compile(r"(\d{6,})\.safetensors")
 

@@ -23,9 +23,17 @@ def write_durably(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
     reach(Failpoint.FILE_WRITTEN)
     partial.replace(path)
-    # The rename itself is durable once the folder is synced.
-    folder = os.open(path.parent, os.O_RDONLY)
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes names in a folder durable: files that were made or renamed.
+
+    Raises:
+        OSError: The disk refuses.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(descriptor)
     finally:
-        os.close(folder)
+        os.close(descriptor)
