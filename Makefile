@@ -6,6 +6,8 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 READY := .venv/.ready
+# Tests wait for processes much of the time: one more than there are processors.
+TEST_PROCESSES ?= $(shell expr `nproc` + 1)
 
 .PHONY: run test check bench faults clean
 
@@ -13,7 +15,7 @@ run: $(READY)
 	$(BIN)/clothbus run handkerchief-quickstart --actors 2
 
 test: $(READY)
-	$(BIN)/pytest
+	$(BIN)/pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 check: $(READY)
 	$(BIN)/ruff format --check .
