@@ -14,11 +14,14 @@ from __future__ import annotations
 import argparse
 import json
 import secrets
+import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections import Counter
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -60,7 +63,12 @@ JOIN_SECS = 180.0
 STEPS = 2
 PICTURE = (84, 84, 1)
 """Three of them are 21 KB."""
+Reply = TypeVar("Reply")
 SPOOL_BYTES = 4 << 20
+ANSWER_SECS = 120.0
+RETRY_SECS = 0.5
+FLUSH_SECS = 60.0
+"""How long what is left may take at the end."""
 WARM_UP_SHARE = 0.2
 """Of the time; memory is compared with what it was at the end of it."""
 GROWTH_BOUND_MIB = 100.0
@@ -85,7 +93,7 @@ class LightActor:
     def __init__(self, address: str, name: str, spools: Path, rate: float) -> None:
         self.name = name
         self.sent = 0
-        self.ack_secs: list[float] = []
+        self.failure: str | None = None
         self._address = address
         self._spools = spools
         self._pause_secs = 1 / rate if rate else 0.0
@@ -95,6 +103,14 @@ class LightActor:
         self._fetched = -1
 
     def run(self, ready: threading.Barrier, secs: float) -> None:
+        """As `_act`; notes why it could not go on."""
+        try:
+            self._act(ready, secs)
+        except Exception:
+            self.failure = traceback.format_exc()
+            ready.abort()
+
+    def _act(self, ready: threading.Barrier, secs: float) -> None:
         """Joins, waits for the others, acts for a while and delivers what is left."""
         spool = Spool(self._spools / f"{self.name}.sqlite", RUN, self.name, self._incarnation,
                       SPOOL_BYTES)  # fmt: skip
@@ -117,29 +133,23 @@ class LightActor:
                         self.sent += 1
                         delivery.notify()
                     time.sleep(max(0.0, began_secs + self._pause_secs - time.monotonic()))
-                assert delivery.flush(wait_until(time.monotonic() + 60)), "not all was acked"
+                flushed = delivery.flush(wait_until(time.monotonic() + FLUSH_SECS))
+                assert flushed, f"{self.name}: {spool.status()} was not acked in {FLUSH_SECS} s"
 
     def _attach(self, bus: Bus) -> Welcome:
         request = Attach("actor", self.name, self._incarnation, SCHEMA_VERSION, VERSION, "")
-        key = bus.keys.attach("actor", self.name)
-        return bus.ask(key, request, Welcome, timeout_secs=30)
+        return _ask(bus, bus.keys.attach("actor", self.name), request, Welcome)
 
     def _next_ticket(self, bus: Bus) -> Ticket | None:
         request = TicketRequest(self.name, self._incarnation, secrets.token_hex(8))
-        key = bus.keys.ticket(self.name)
-        while True:
-            try:
-                reply = bus.ask(key, request, TicketReply, timeout_secs=10)
-            except OwnerUnreachable:
-                continue  # the same question again
-            assert reply.instruction in (Instruction.COLLECT, Instruction.WAIT), reply
-            return reply.ticket
+        reply = _ask(bus, bus.keys.ticket(self.name), request, TicketReply)
+        assert reply.instruction in (Instruction.COLLECT, Instruction.WAIT), reply
+        return reply.ticket
 
     def _fetch(self, bus: Bus, ticket: Ticket, newest: Snapshot | None) -> None:
         version = ticket.policy_version
         if version != self._fetched and (newest is None or newest.version != version):
-            bus.ask(bus.keys.policy_version(version), SnapshotRequest(version), Snapshot,
-                    timeout_secs=30)  # fmt: skip
+            _ask(bus, bus.keys.policy_version(version), SnapshotRequest(version), Snapshot)
         self._fetched = version
 
     def _play(self, id_: TrajectoryId, ticket: Ticket) -> Trajectory:
@@ -158,6 +168,18 @@ class LightActor:
         )
 
 
+def _ask(bus: Bus, key: str, request: object, expected: type[Reply]) -> Reply:
+    """Asks as actors do: the same question again, after a pause, until there is an answer."""
+    deadline_secs = time.monotonic() + ANSWER_SECS
+    while True:
+        try:
+            return bus.ask(key, request, expected, timeout_secs=30)
+        except OwnerUnreachable:
+            if time.monotonic() > deadline_secs:
+                raise
+            time.sleep(RETRY_SECS)
+
+
 def act(arguments: argparse.Namespace) -> None:
     """One process with a share of the actors; writes what each has sent."""
     ready = threading.Barrier(arguments.actors, lambda: _wait_for_start(arguments.report))
@@ -170,6 +192,8 @@ def act(arguments: argparse.Namespace) -> None:
         thread.start()
     for thread in threads:
         thread.join()
+    if failures := [it.failure for it in actors if it.failure is not None]:
+        sys.exit(f"{len(failures)} of {len(actors)} actors failed; the first:\n{failures[0]}")
     arguments.report.write_text(json.dumps({it.name: it.sent for it in actors}))
 
 
@@ -231,7 +255,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, object]:
         for report in folder.glob("sent-*.json"):
             sent.update(json.loads(report.read_text()))
         stored, spare, payload_bytes = _stored(folder / RUN / JOURNAL_FILE)
-        assert stored == sent, "what was acked is not what the journal holds"
+        wrong = {name: (sent[name], stored[name]) for name in sent | stored}
+        wrong = {name: counts for name, counts in wrong.items() if counts[0] != counts[1]}
+        assert not wrong, f"sent, and found in the journal: {wrong}"
         count = sent.total()
         return {
             "actors": arguments.actors,
