@@ -15,7 +15,7 @@ def test_the_files_are_what_zenoh_accepts_and_decide_the_defaults():
     assert router.get_json("listen/endpoints") == f'["{DEFAULT_ADDRESS}"]'
     assert client.get_json("connect/endpoints") == f'["{DEFAULT_ADDRESS}"]'
     for config in (router, client):
-        assert config.get_json(LEASE) == "2000"
+        assert config.get_json(LEASE) == "10000"
         assert config.get_json("scouting/multicast/enabled") == "false"
         assert config.get_json("timestamping/enabled") == "true"
         assert config.get_json("transport/shared_memory/enabled") == "false"
