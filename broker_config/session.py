@@ -11,6 +11,7 @@ import json
 import os
 import re
 import socket
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -28,6 +29,9 @@ OVERRIDE_VARIABLE = "CLOTHBUS_ZENOH_OVERRIDE"
 _FILES: dict[Mode, str] = {"router": "router.json5", "client": "session.json5"}
 _ENDPOINTS: dict[Mode, str] = {"router": "listen/endpoints", "client": "connect/endpoints"}
 _PORT_TRIES = 20
+BUSY_ROUTER_SECS = 20.0
+"""A router that listens but does not answer is waited for: while it holds a link on which nothing
+moves any more, it takes in nobody."""
 
 
 def open_session(
@@ -52,15 +56,21 @@ def open_session(
 
     Raises:
         ConfigurationError: An unknown key, or an unusable value.
-        RouterUnreachable: Nobody answers at the address within `connect/timeout_ms`.
+        RouterUnreachable: Nobody answers at the address within `connect/timeout_ms`, or within
+            `BUSY_ROUTER_SECS` where somebody listens.
         AddressInUse: Another process listens there.
     """
     config = load_config(mode, address, overrides, config_file, environment)
-    endpoints = ", ".join(json.loads(config.get_json(_ENDPOINTS[mode])))
-    try:
-        return zenoh.open(config)
-    except zenoh.ZError as error:
-        raise _explained(mode, endpoints, error) from error
+    endpoints = json.loads(config.get_json(_ENDPOINTS[mode]))
+    deadline = time.monotonic() + BUSY_ROUTER_SECS
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            explained = _explained(mode, ", ".join(endpoints), error)
+            unreachable = isinstance(explained, RouterUnreachable)
+            if not (unreachable and time.monotonic() < deadline and _somebody_listens(endpoints)):
+                raise explained from error
 
 
 def open_router_on_free_port(
@@ -89,6 +99,21 @@ def open_router_on_free_port(
         f"router on {host}: expected a free port; got {_PORT_TRIES} that were taken; "
         "give an address with --listen"
     ) from last_error
+
+
+def _somebody_listens(endpoints: Sequence[str]) -> bool:
+    """Whether one of the addresses takes connections; of TCP addresses alone it can be said."""
+    for endpoint in endpoints:
+        transport, _, place = endpoint.partition("/")
+        host, _, port = place.partition("?")[0].rpartition(":")
+        if transport != "tcp" or not port.isdigit():
+            continue
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=1.0).close()
+        except OSError:
+            continue
+        return True
+    return False
 
 
 def _free_ports(host: str) -> Iterator[int]:
@@ -142,7 +167,7 @@ def _override(config: zenoh.Config, override: str, origin: str) -> None:
     if not separator:
         raise ConfigurationError(
             f"Zenoh override {override!r} from {origin}: expected key/path=value; "
-            "write for example transport/link/tx/lease=2000"
+            "write for example connect/timeout_ms=10000"
         )
     _insert(config, key.strip(), value.strip(), origin)
 

@@ -62,6 +62,15 @@ class RouterProcess:
         self._process.send_signal(signal.SIGKILL)
         self._process.communicate()
 
+    @contextlib.contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Holds it, as if it hung: it listens, and answers nothing."""
+        self._process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._process.send_signal(signal.SIGCONT)
+
     def restart(self) -> None:
         """Starts it again at the same address."""
         self._process = self._start(self.address)

@@ -84,6 +84,28 @@ def test_a_client_may_start_before_its_router(free_port):
     assert opened == [True]
 
 
+def test_a_router_that_listens_but_hangs_is_waited_for(own_router, monkeypatch, wait_until):
+    hasty = ["connect/timeout_ms=300", "transport/unicast/open_timeout=300"]
+    opened = []
+
+    def attach():
+        with open_session("client", own_router.address, hasty):
+            opened.append(True)
+
+    with own_router.stopped():
+        with monkeypatch.context() as patch:
+            patch.setattr("broker_config.session.BUSY_ROUTER_SECS", 0.0)
+            with pytest.raises(RouterUnreachable):
+                open_session("client", own_router.address, hasty)
+        thread = threading.Thread(target=attach)
+        thread.start()
+        thread.join(1.0)  # three times what a router has that nobody listens for
+        assert not opened
+        assert thread.is_alive()
+    wait_until(lambda: opened, "the router goes on")
+    thread.join()
+
+
 def test_an_asker_gets_its_answer_after_the_router_was_killed_and_restarted(own_router, wait_until):
     def answer(key, request, responder):
         responder.reply(ControlReply(request.command, "paused"))
