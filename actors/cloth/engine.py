@@ -5,6 +5,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.cloth.gestures import Gesture
 from actors.cloth.meshes import ClothMesh
 
 TABLE_HALF_WIDTH_M = 0.6
@@ -18,7 +19,7 @@ class ClothEngineError(RuntimeError):
 
 
 class ClothEngine(Protocol):
-    """One piece of cloth on a table, moved by picking it up and dropping it.
+    """One piece of cloth on a table, moved by the gestures of hands.
 
     World frame: origin at the middle of the table's top, x to the right and y upwards in the
     camera's picture, z up. Engines draw no random numbers: what they are given decides.
@@ -55,16 +56,16 @@ class ClothEngine(Protocol):
         """
         ...
 
-    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
-        """Grasp vertices, lift, carry, lower, let go, and let the cloth come to rest.
+    def perform(self, gesture: Gesture) -> None:
+        """Let hands take hold, move and let go, and let the cloth come to rest.
+
+        What a hand holds keeps its shape while it is carried.
 
         Args:
-            grasped: i64[k], 1 <= k <= 4, vertex ids; the first is the one that is carried to the
-                drop point.
-            drop_xy_m: where on the table, metres.
+            gesture: of one hand or several, made for where the cloth is now.
 
         Raises:
-            ValueError: an id or the drop point is out of the rule.
+            ValueError: it names a vertex that the cloth lacks, or one for two hands.
             ClothEngineError: before the first reset, or the simulator was lost.
         """
         ...

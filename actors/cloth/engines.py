@@ -30,6 +30,32 @@ def make_engine(name: str, settings: Settings | None = None) -> ClothEngine:
     return ENGINES[name](settings or {})
 
 
+def with_material(
+    name: str, settings: Settings | None, *, stiffness: float, friction: float
+) -> Settings:
+    """Settings of an engine for cloth that is stiffer and rougher by these factors.
+
+    Args:
+        name: a key of `ENGINES`.
+        settings: as for `make_engine`.
+        stiffness: what resistance to bending is multiplied with.
+        friction: what friction with the table, and of layers, is multiplied with.
+    """
+    given = dict(settings or {})
+    if name == "pybullet":
+        usual = PyBulletSettings(**given)
+        return given | {
+            "bending_stiffness": usual.bending_stiffness * stiffness,
+            "friction": usual.friction * friction,
+        }
+    cloth = XpbdSettings(**given)
+    return given | {
+        "bending_compliance": cloth.bending_compliance / stiffness,
+        "table_friction": cloth.table_friction * friction,
+        "layer_friction": cloth.layer_friction * friction,
+    }
+
+
 def _pybullet(settings: Settings) -> ClothEngine:
     _check_names("pybullet", settings, PyBulletSettings.__dataclass_fields__)
     return PyBulletProcessEngine(PyBulletSettings(**settings))

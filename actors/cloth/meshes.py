@@ -1,8 +1,7 @@
-"""Triangle meshes of cloth that lies flat, and the file format in which PyBullet wants them."""
+"""Triangle meshes of cloth that lies flat."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +45,11 @@ class ClothMesh:
         """f64[E], the length of each edge while nothing pulls at it, in the order of `edges`."""
         return edge_lengths_m(self.vertices_m, self.edges)
 
+    @cached_property
+    def spacing_m(self) -> float:
+        """The length of a typical edge: their median."""
+        return float(np.median(self.rest_edge_lengths_m))
+
 
 def edge_lengths_m(
     vertices_m: NDArray[np.float64], edges: NDArray[np.int32]
@@ -75,13 +79,6 @@ def rectangular_sheet(vertices_per_side: int, size_m: float) -> ClothMesh:
     y_m, x_m = np.meshgrid(ticks_m, ticks_m, indexing="ij")
     vertices_m = np.stack([x_m, y_m, np.zeros_like(x_m)], axis=-1).reshape(-1, 3)
     return ClothMesh(vertices_m, _sheet_faces(vertices_per_side))
-
-
-def write_obj(mesh: ClothMesh, path: Path) -> None:
-    """Write the mesh as a Wavefront OBJ file, whose vertex ids begin at 1."""
-    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices_m]
-    lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + 1]
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _sheet_faces(n: int) -> NDArray[np.int32]:

@@ -15,6 +15,8 @@ from actors.cloth.masks import cloth_mask
 GRID_ROWS = 2
 GRID_COLUMNS = 3
 N_CONTOUR_POINTS = 8
+EXTREMES_DEG = (0.0, 25.0, 80.0, 145.0, 180.0, 215.0, 280.0, 335.0)
+"""Clockwise from the picture's top; on a spread t-shirt: neck, shoulders, sleeves, hem."""
 RIM_PX = 2  # how far inside of the outline a contour point lies, so that it hits cloth
 
 PickPoints = Callable[[NDArray[np.uint8]], NDArray[np.int64]]
@@ -74,6 +76,36 @@ def contour_pick_points(picture: NDArray[np.uint8]) -> NDArray[np.int64]:
     outline = _clockwise_from_top(_outline(cloth_mask(picture)), pixels.mean(axis=0))
     targets = np.concatenate([_equally_spaced(outline, N_CONTOUR_POINTS), _half_centroids(pixels)])
     return _snapped(targets, pixels)
+
+
+def extreme_pick_points(picture: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """The cloth's outermost points in 8 directions, and 2 inside of it.
+
+    Of equally far points the one nearest to the straight line from the centroid; a pick point lies
+    a little inside of the outline. The inner points are those of `contour_pick_points`.
+
+    Source: table 3.3a, "from 10 points over its current area". **assumed**: the directions.
+
+    Args:
+        picture: u8[H, W, 3].
+
+    Returns:
+        i64[10, 2], column and row, clockwise from the top, then left and right inner point.
+
+    Raises:
+        NoClothInViewError: the picture shows no cloth.
+    """
+    pixels = _cloth_pixels(picture)
+    centroid = pixels.mean(axis=0)
+    rim = _outline(cloth_mask(picture))
+    away = rim - centroid
+    extremes = []
+    for angle_rad in np.deg2rad(EXTREMES_DEG):
+        along = away @ np.array([np.sin(angle_rad), -np.cos(angle_rad)])
+        aside = np.abs(away @ np.array([np.cos(angle_rad), np.sin(angle_rad)]))
+        outermost = np.flatnonzero(along >= along.max() - 0.5)
+        extremes.append(rim[outermost[aside[outermost].argmin()]])
+    return _snapped(np.concatenate([np.array(extremes), _half_centroids(pixels)]), pixels)
 
 
 def _cloth_pixels(picture: NDArray[np.uint8]) -> NDArray[np.int64]:

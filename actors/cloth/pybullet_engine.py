@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,19 +14,14 @@ from actors.cloth.engine import (
     ClothEngineError,
     checked_vertices,
 )
-from actors.cloth.gripper import (
-    GripperMotion,
-    check_drop,
-    check_grasp,
-    gripper_path_in_world,
-)
-from actors.cloth.meshes import ClothMesh, write_obj
+from actors.cloth.gestures import Gesture, Hand, hand_paths_in_world
+from actors.cloth.meshes import ClothMesh
+from actors.cloth.obj_files import write_obj
 from actors.cloth.pybullet_settings import PyBulletSettings
 from actors.cloth.quiet_pybullet import pybullet
 
 TABLE_THICKNESS_M = 0.1
 SETTLE_AFTER_RESET_SECS = 0.05
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass
@@ -39,7 +34,6 @@ class PyBulletEngine:
     """
 
     settings: PyBulletSettings = field(default_factory=PyBulletSettings)
-    motion: GripperMotion = field(default_factory=GripperMotion)
 
     def __post_init__(self) -> None:
         """Begin without a world; `reset` makes it."""
@@ -89,19 +83,27 @@ class PyBulletEngine:
             )
         return array
 
-    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
-        """Carry some vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
-        check_grasp(grasped, len(self.mesh.vertices_m))
-        check_drop(drop_xy_m)
-        start = self.vertices_in_world()[grasped[0]]
-        path = gripper_path_in_world(start, drop_xy_m, self.motion, self.settings.time_step_secs)
-        with self._grasp(grasped, start) as gripper:
-            for position in path:
-                pybullet.resetBasePositionAndOrientation(
-                    gripper, position.tolist(), _UPRIGHT, physicsClientId=self._client
-                )
+    def perform(self, gesture: Gesture) -> None:
+        """Let hands move the cloth; see `ClothEngine.perform`."""
+        gesture.check(len(self.mesh.vertices_m))
+        vertices = self.vertices_in_world()
+        starts = np.stack([vertices[hand.grasped[0]] for hand in gesture.hands])
+        paths = hand_paths_in_world(starts, gesture, self.settings.time_step_secs)
+        with ExitStack() as held:
+            grippers = [
+                held.enter_context(self._grasp(hand, start))
+                for hand, start in zip(gesture.hands, starts, strict=True)
+            ]
+            for row in paths.tolist():
+                for hand, gripper, (*position, turn_rad) in zip(
+                    gesture.hands, grippers, row, strict=True
+                ):
+                    turned = pybullet.getQuaternionFromAxisAngle(hand.turn_axis, turn_rad)
+                    pybullet.resetBasePositionAndOrientation(
+                        gripper, position, turned, physicsClientId=self._client
+                    )
                 pybullet.stepSimulation(physicsClientId=self._client)
-        self._simulate(self.motion.settle_secs)
+        self._simulate(gesture.motion.settle_secs)
 
     def close(self) -> None:
         """Give the world back; may be called twice."""
@@ -160,7 +162,7 @@ class PyBulletEngine:
             )
 
     @contextmanager
-    def _grasp(self, grasped: NDArray[np.int64], start: NDArray[np.float64]) -> Iterator[int]:
+    def _grasp(self, hand: Hand, start: NDArray[np.float64]) -> Iterator[int]:
         """A body without mass that holds the vertices, and lets go of them whatever happens."""
         client = self._client
         gripper = pybullet.createMultiBody(
@@ -168,7 +170,7 @@ class PyBulletEngine:
         )
         anchors: list[int] = []
         try:
-            for vertex in grasped.tolist():
+            for vertex in hand.grasped.tolist():
                 anchors.append(
                     pybullet.createSoftBodyAnchor(
                         self._cloth, vertex, gripper, -1, physicsClientId=client

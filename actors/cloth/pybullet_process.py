@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from actors.cloth.engine import ClothEngineError, checked_vertices
 from actors.cloth.frames import read_frame, write_frame
-from actors.cloth.gripper import GripperMotion, check_drop, check_grasp
+from actors.cloth.gestures import Gesture
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.pybullet_settings import PyBulletSettings
 
@@ -31,12 +31,11 @@ _PACKAGES = Path(__file__).resolve().parents[2]
 class PyBulletProcessEngine:
     """A `ClothEngine`: the cloth of `PyBulletEngine`, exactly repeatable and out of harm's way.
 
-    The same mesh, vertices and sequence of grasps and drops give the same vertices, bit by bit,
-    in every process on one type of CPU. It cannot save and restore a state.
+    The same mesh, vertices and sequence of gestures give the same vertices, bit by bit, in every
+    process on one type of CPU. It cannot save and restore a state.
     """
 
     settings: PyBulletSettings = field(default_factory=PyBulletSettings)
-    motion: GripperMotion = field(default_factory=GripperMotion)
     reply_timeout_secs: float = REPLY_TIMEOUT_SECS
 
     def __post_init__(self) -> None:
@@ -72,7 +71,6 @@ class PyBulletProcessEngine:
         self._ask(
             {
                 "settings": asdict(self.settings),
-                "motion": asdict(self.motion),
                 "mesh_vertices": mesh.vertices_m.tobytes(),
                 "faces": mesh.faces.tobytes(),
                 "vertices": vertices.tobytes(),
@@ -85,12 +83,19 @@ class PyBulletProcessEngine:
         assert len(self._vertices) == len(self.mesh.vertices_m)
         return self._vertices.copy()
 
-    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
-        """Carry some vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
-        check_grasp(grasped, len(self.mesh.vertices_m))
-        check_drop(drop_xy_m)
-        drop = [float(metres) for metres in drop_xy_m]
-        self._ask({"grasped": grasped.tolist(), "drop_xy_m": drop})
+    def perform(self, gesture: Gesture) -> None:
+        """Let hands move the cloth; see `ClothEngine.perform`."""
+        gesture.check(len(self.mesh.vertices_m))
+        hands = [
+            {
+                "grasped": hand.grasped.tolist(),
+                "stations": hand.stations_in_world.tolist(),
+                "turns": None if hand.turns_rad is None else hand.turns_rad.tolist(),
+                "axis": hand.turn_axis,
+            }
+            for hand in gesture.hands
+        ]
+        self._ask({"hands": hands, "motion": asdict(gesture.motion)})
 
     def close(self) -> None:
         """End the process; may be called twice."""

@@ -3,7 +3,7 @@
     python -m actors.cloth.pybullet_worker
 
 Each request and each reply is a msgpack map in a frame. The first request lays the cloth on the
-table, each later one picks it up and drops it; every reply holds the vertices. The process ends
+table, each later one is a gesture; every reply holds the vertices. The process ends
 when its input does. An error ends it too, with a traceback on standard error.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.frames import read_frame, write_frame
-from actors.cloth.gripper import GripperMotion
+from actors.cloth.gestures import Gesture, GripperMotion, Hand
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.pybullet_engine import PyBulletEngine
 from actors.cloth.pybullet_settings import PyBulletSettings
@@ -31,9 +31,7 @@ def serve(requests: int, replies: int) -> None:
     engine = _engine_with_cloth(msgpack.unpackb(read_frame(requests)))
     while True:
         write_frame(replies, msgpack.packb({"vertices": engine.vertices_in_world().tobytes()}))
-        request = msgpack.unpackb(read_frame(requests))
-        x_m, y_m = request["drop_xy_m"]
-        engine.pick_and_drop(np.array(request["grasped"], dtype=np.int64), (x_m, y_m))
+        engine.perform(_gesture(msgpack.unpackb(read_frame(requests))))
 
 
 def main() -> None:
@@ -47,13 +45,24 @@ def main() -> None:
 
 
 def _engine_with_cloth(request: dict[str, Any]) -> PyBulletEngine:
-    engine = PyBulletEngine(
-        PyBulletSettings(**request["settings"]), GripperMotion(**request["motion"])
-    )
+    engine = PyBulletEngine(PyBulletSettings(**request["settings"]))
     faces = np.frombuffer(request["faces"], dtype=np.int32).reshape(-1, 3)
     mesh = ClothMesh(_points(request["mesh_vertices"]), faces)
     engine.reset(mesh, _points(request["vertices"]))
     return engine
+
+
+def _gesture(request: dict[str, Any]) -> Gesture:
+    hands = [
+        Hand(
+            np.array(hand["grasped"], dtype=np.int64),
+            np.array(hand["stations"]),
+            None if hand["turns"] is None else np.array(hand["turns"]),
+            tuple(hand["axis"]),
+        )
+        for hand in request["hands"]
+    ]
+    return Gesture(tuple(hands), GripperMotion(**request["motion"]))
 
 
 def _points(raw: bytes) -> NDArray[np.float64]:

@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from actors.cloth.camera import Camera
 
 SUBPIXELS = 256
-AMBIENT = 0.45  # brightness of a face that the light does not reach
-_LIGHT = np.array([0.25, 0.20, 0.95])
-LIGHT_DIRECTION = _LIGHT / np.linalg.norm(_LIGHT)
 
 Rgb = tuple[int, int, int]
 
@@ -50,11 +47,55 @@ HANDKERCHIEF_COLOURS = ClothColours()
 """Green in front, red behind."""
 
 
+@dataclass(frozen=True)
+class Light:
+    """A far lamp and what the room throws back."""
+
+    direction: tuple[float, float, float] = (0.25, 0.20, 0.95)
+    """Towards the lamp; any length."""
+
+    ambient: float = 0.45
+    """Brightness of a face that the lamp does not reach, over that of one that faces it."""
+
+    strength: float = 1.0
+    """What every colour is multiplied with."""
+
+    def __post_init__(self) -> None:
+        """Check each number.
+
+        Raises:
+            ValueError: the lamp is below the table, or a portion is out of range.
+        """
+        if not (np.isfinite(self.direction).all() and self.direction[2] > 0.0):
+            raise ValueError(
+                f"Light.direction: expected a direction upwards; got {self.direction}; "
+                f"the default is {Light.direction}"
+            )
+        if not (0.0 <= self.ambient <= 1.0 and 0.2 <= self.strength <= 2.0):
+            raise ValueError(
+                "Light: expected ambient from 0 to 1 and strength from 0.2 to 2; got "
+                f"{self.ambient} and {self.strength}; the defaults are 0.45 and 1"
+            )
+
+    def brightness(self, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the colours of faces are multiplied with, f64[F], for unit normals f64[F, 3]."""
+        towards = np.array(self.direction) / np.linalg.norm(self.direction)
+        lit = np.maximum((normals * towards).sum(axis=1), 0.0)
+        return np.asarray(self.strength * (self.ambient + (1.0 - self.ambient) * lit))
+
+
+DAYLIGHT = Light()
+"""From above, a little from the right and from behind."""
+
+
 def draw_cloth(
     vertices_in_world: NDArray[np.float64],
     faces: NDArray[np.int32],
     camera: Camera,
     colours: ClothColours = HANDKERCHIEF_COLOURS,
+    *,
+    front_paint: NDArray[np.uint8] | None = None,
+    light: Light = DAYLIGHT,
 ) -> NDArray[np.uint8]:
     """The camera's picture of cloth on the table.
 
@@ -63,6 +104,9 @@ def draw_cloth(
         faces: i32[F, 3], vertex ids, counter-clockwise seen from the front side.
         camera: from where.
         colours: of the cloth's two sides and of the table.
+        front_paint: u8[F, 3], the colour of each face's front side, where it is not everywhere the
+            same: prints and markers.
+        light: from where and how bright.
 
     Returns:
         u8[size_px, size_px, 3], red, green, blue.
@@ -72,10 +116,16 @@ def draw_cloth(
     """
     _check_vertices(vertices_in_world, camera)
     corners = np.rint(camera.project_px(vertices_in_world) * SUBPIXELS).astype(np.int64)
-    nearness = 1.0 / (camera.height_m - vertices_in_world[:, 2])
-    shaded, front_seen = _face_colours(vertices_in_world, faces, corners, colours)
+    nearness = 1.0 / camera.depths_m(vertices_in_world)
+    front_seen = (
+        _twice_area(*(corners[faces[:, k]] for k in range(3))) < 0
+    )  # the picture's y is down
+    fronts = np.array(colours.front) if front_paint is None else front_paint
+    plain = np.where(front_seen[:, None], fronts, colours.back)
+    brightness = light.brightness(_seen_normals(vertices_in_world, faces, front_seen))
+    shaded = np.minimum(np.floor(plain * brightness[:, None]), 255).astype(np.uint8)
     picture = np.empty((camera.size_px, camera.size_px, 3), dtype=np.uint8)
-    picture[:] = colours.table
+    picture[:] = np.minimum(np.floor(np.array(colours.table) * light.strength), 255)
     _fill_triangles(corners, nearness, faces, shaded, front_seen, picture)
     return picture
 
@@ -86,32 +136,24 @@ def _check_vertices(vertices_in_world: NDArray[np.float64], camera: Camera) -> N
             "vertices_in_world: expected finite coordinates; got a NaN or an infinity; "
             "guard() the engine's state before drawing it"
         )
-    highest_m = float(vertices_in_world[:, 2].max())
-    if highest_m >= camera.height_m:
+    nearest_m = float(camera.depths_m(vertices_in_world).min())
+    if nearest_m <= 0.0:
+        highest_m = float(vertices_in_world[:, 2].max())
         raise ValueError(
             f"vertices_in_world: expected heights below the camera's {camera.height_m} m; got "
             f"{highest_m:.3f} m; guard() the engine's state before drawing it"
         )
 
 
-def _face_colours(
-    vertices_in_world: NDArray[np.float64],
-    faces: NDArray[np.int32],
-    corners: NDArray[np.int64],
-    colours: ClothColours,
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The shaded colour of each face's visible side, u8[F, 3], and whether that is the front."""
-    seen_area = _twice_area(corners[faces[:, 0]], corners[faces[:, 1]], corners[faces[:, 2]])
-    front_seen = seen_area < 0  # counter-clockwise in the world, and the picture's y points down
+def _seen_normals(
+    vertices_in_world: NDArray[np.float64], faces: NDArray[np.int32], front_seen: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """The unit normal of each face's visible side, f64[F, 3]."""
     a, b, c = (vertices_in_world[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-15
     normals[~front_seen] *= -1.0
-    brightness = AMBIENT + (1.0 - AMBIENT) * np.maximum(
-        (normals * LIGHT_DIRECTION).sum(axis=1), 0.0
-    )
-    plain = np.where(front_seen[:, None], colours.front, colours.back)
-    return np.floor(plain * brightness[:, None]).astype(np.uint8), front_seen
+    return normals
 
 
 def _twice_area(

@@ -27,8 +27,6 @@ class DistanceConstraints:
     """f64[C]."""
     compliances: NDArray[np.float64]
     """f64[C]."""
-    spacing_m: float
-    """Of the mesh: what its short edges measure."""
     neighbours: NDArray[np.int32]
     """i32[K], for each vertex in turn those that it does not collide with."""
     first_neighbour: NDArray[np.int32]
@@ -40,15 +38,12 @@ def distance_constraints(mesh: ClothMesh, settings: XpbdSettings) -> DistanceCon
 
     In the mesh's own order each sweep would push errors in one direction.
     """
-    spacing_m = float(np.percentile(mesh.rest_edge_lengths_m, 20))
-    is_long = mesh.rest_edge_lengths_m > LONG_EDGE * spacing_m
-    diagonals = np.concatenate(
-        [mesh.edges[is_long], _other_diagonals(mesh, SHORT_DIAGONAL * spacing_m)]
-    )
+    is_long = mesh.rest_edge_lengths_m > LONG_EDGE * mesh.spacing_m
+    across, bends = _opposite_vertices(mesh, SHORT_DIAGONAL * mesh.spacing_m)
     kinds = [
         (mesh.edges[~is_long], settings.stretch_compliance),
-        (diagonals, settings.shear_compliance),
-        (_two_apart_on_a_line(mesh), settings.bending_compliance),
+        (np.concatenate([mesh.edges[is_long], across]), settings.shear_compliance),
+        (_united(bends, _two_apart_on_a_line(mesh)), settings.bending_compliance),
     ]
     pairs = np.concatenate([ids for ids, _ in kinds]).astype(np.int32)
     compliances = np.concatenate([np.full(len(ids), value) for ids, value in kinds])
@@ -56,13 +51,19 @@ def distance_constraints(mesh: ClothMesh, settings: XpbdSettings) -> DistanceCon
     pairs, compliances = np.ascontiguousarray(pairs[order]), compliances[order]
     ends = mesh.vertices_m[pairs]
     lengths_m = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    close_m = settings.thickness_cells * spacing_m * 1.05
+    close_m = settings.thickness_cells * mesh.spacing_m * 1.05
     neighbours, first = _never_colliding(mesh, close_m)
-    return DistanceConstraints(pairs, lengths_m, compliances, spacing_m, neighbours, first)
+    return DistanceConstraints(pairs, lengths_m, compliances, neighbours, first)
 
 
-def _other_diagonals(mesh: ClothMesh, longest_m: float) -> NDArray[np.int32]:
-    """Opposite vertices of two triangles with a common edge, where they are close, i32[K, 2]."""
+def _opposite_vertices(
+    mesh: ClothMesh, longest_diagonal_m: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Opposite vertices of two triangles with a common edge: those close, and those far apart.
+
+    Close ones are the other diagonal of a cell and resist shear, the others resist bending over the
+    edge. Either i32[K, 2].
+    """
     opposite: dict[tuple[int, int], list[int]] = {}
     for a, b, c in mesh.faces.tolist():
         for one, two, third in ((a, b, c), (b, c, a), (c, a, b)):
@@ -71,8 +72,12 @@ def _other_diagonals(mesh: ClothMesh, longest_m: float) -> NDArray[np.int32]:
     found = {(min(pair), max(pair)) for pair in opposite.values() if len(pair) == 2}
     ids = np.array(sorted(found - edges), np.int32).reshape(-1, 2)
     ends = mesh.vertices_m[ids]
-    is_short: NDArray[np.bool_] = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) < longest_m
-    return np.asarray(ids[is_short])
+    is_short = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) < longest_diagonal_m
+    return ids[is_short], ids[~is_short]
+
+
+def _united(one: NDArray[np.int32], two: NDArray[np.int32]) -> NDArray[np.int32]:
+    return np.unique(np.concatenate([one, two]), axis=0)
 
 
 def _two_apart_on_a_line(mesh: ClothMesh) -> NDArray[np.int32]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.engine import TABLE_HALF_WIDTH_M, ClothEngineError, checked_vertices
-from actors.cloth.gripper import GripperMotion, check_drop, check_grasp, gripper_path_in_world
+from actors.cloth.gestures import Gesture, hand_paths_in_world, turns_in_world
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.xpbd_constraints import distance_constraints
 from actors.cloth.xpbd_settings import XpbdSettings
@@ -42,7 +42,6 @@ class XpbdEngine:
     """
 
     settings: XpbdSettings = field(default_factory=XpbdSettings)
-    motion: GripperMotion = field(default_factory=GripperMotion)
 
     def __post_init__(self) -> None:
         """Begin without cloth."""
@@ -75,19 +74,16 @@ class XpbdEngine:
         _ = self.mesh
         return self._body.positions_m.copy()
 
-    def pick_and_drop(self, grasped: NDArray[np.int64], drop_xy_m: tuple[float, float]) -> None:
-        """Carry vertices to a point of the table; see `ClothEngine.pick_and_drop`."""
-        check_grasp(grasped, len(self.mesh.vertices_m))
-        check_drop(drop_xy_m)
-        start_m = self._body.positions_m[grasped]
-        path_m = gripper_path_in_world(
-            start_m[0], drop_xy_m, self.motion, self._numbers.substep_secs
-        )
+    def perform(self, gesture: Gesture) -> None:
+        """Let hands move the cloth; see `ClothEngine.perform`."""
+        gesture.check(len(self.mesh.vertices_m))
+        grasped = np.concatenate([hand.grasped for hand in gesture.hands])
+        path_m = self._grasped_path_m(gesture)
         self._body.inverse_masses[grasped] = 0.0
-        self._advance(len(path_m), grasped, path_m[:, None] + (start_m - start_m[0]))
+        self._advance(len(path_m), grasped, path_m)
         self._body.inverse_masses[grasped] = 1.0
         self._body.velocities_m_per_s[grasped] = 0.0  # fingers stop before they open
-        self._settle(self.motion.settle_secs)
+        self._settle(gesture.motion.settle_secs)
 
     def save(self) -> XpbdState:
         """The whole state, independent of what the engine does next."""
@@ -108,7 +104,7 @@ class XpbdEngine:
         settings = self.settings
         constraints = distance_constraints(mesh, settings)
         substep_secs = 1 / settings.substeps_per_sec
-        thickness_m = settings.thickness_cells * constraints.spacing_m
+        thickness_m = settings.thickness_cells * mesh.spacing_m
         skin_m = SKIN_THICKNESSES * thickness_m
         cell_m = thickness_m + skin_m
         self._distances = Distances(
@@ -140,6 +136,21 @@ class XpbdEngine:
         body.velocities_m_per_s[:] = velocities_m_per_s
         body.inverse_masses[:] = 1.0
         body.n_close_pairs[0] = -1
+
+    def _grasped_path_m(self, gesture: Gesture) -> NDArray[np.float64]:
+        """Where each grasped vertex is after each substep, f64[K, k, 3]: rigid with its hand."""
+        positions_m = self._body.positions_m
+        firsts = [hand.grasped[0] for hand in gesture.hands]
+        paths = hand_paths_in_world(positions_m[firsts], gesture, self._numbers.substep_secs)
+        held_m = []
+        for index, hand in enumerate(gesture.hands):
+            offsets_m = positions_m[hand.grasped] - positions_m[hand.grasped[0]]
+            if hand.turns_rad is None:
+                turned_m = offsets_m[None]
+            else:
+                turned_m = offsets_m @ turns_in_world(hand, paths[:, index, 3]).swapaxes(1, 2)
+            held_m.append(paths[:, index, None, :3] + turned_m)
+        return np.concatenate(held_m, axis=1)
 
     def _settle(self, least_secs: float) -> None:
         """Waits until the cloth lies still, at least and at most for a time."""

@@ -7,20 +7,29 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from actors.demonstrate.folding import scripted_tshirt_action
 from actors.demonstrate.scripted import (
     imperfect_action,
     scripted_flip_action,
     scripted_reach_action,
 )
-from actors.envs import ClothbusEnv, HandkerchiefFlipEnv, ReachingEnv
+from actors.envs import (
+    ClothbusEnv,
+    FoldLinesEnv,
+    HandkerchiefFlipEnv,
+    ReachingEnv,
+    TshirtFoldEnv,
+)
 from actors.rollout import Observation
+
+Script = Callable[[Observation], int]
 
 
 @dataclass(frozen=True)
 class ScriptedDemonstrator:
     """Follows a script, except for a share of random actions."""
 
-    script: Callable[[Observation], int]
+    script: Script
     n_actions: int
     mistake_rate: float
 
@@ -37,29 +46,27 @@ def scripted_demonstrator(
     """The demonstrator of a task.
 
     Args:
-        env: The one that it will act in: a script of reaching reads the arm's angles from it.
+        env: The one that it will act in. Scripts see its pictures; that of reaching also the arm's
+            angles, those of folding along lines which step it is.
         n_actions: Of the task.
         mistake_rate: Share of its actions that are random, 0 to 1.
 
     Raises:
         ValueError: The task has no script.
     """
+    return ScriptedDemonstrator(_script(env), n_actions, mistake_rate)
+
+
+def _script(env: ClothbusEnv) -> Script:
     task = env.unwrapped
     if isinstance(task, ReachingEnv):
-        return ScriptedDemonstrator(
-            lambda _: scripted_reach_action(task.joint_angles_rad),
-            n_actions,
-            mistake_rate,
-        )
+        return lambda _: scripted_reach_action(task.joint_angles_rad)
     if isinstance(task, HandkerchiefFlipEnv):
-        return ScriptedDemonstrator(
-            lambda picture: scripted_flip_action(
-                picture,
-                task.pick_rule,
-                cloth_size_m=task.cloth_size_m,
-                view_half_width_m=task.view_half_width_m,
-            ),
-            n_actions,
-            mistake_rate,
+        return lambda picture: scripted_flip_action(
+            picture, task.pick_rule, task.camera, task.flat_px
         )
+    if isinstance(task, TshirtFoldEnv):
+        return lambda picture: scripted_tshirt_action(picture, task.camera)
+    if isinstance(task, FoldLinesEnv):
+        return lambda _: task.task.script[min(task.steps_done, len(task.task.script) - 1)]
     raise ValueError(f"demonstrator: expected a task with a script; got {type(task).__name__}")

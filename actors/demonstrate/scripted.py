@@ -38,11 +38,7 @@ def scripted_reach_action(joint_angles_rad: NDArray[np.float64]) -> int:
 
 
 def scripted_flip_action(
-    picture: NDArray[np.uint8],
-    pick_rule: PickRule,
-    *,
-    cloth_size_m: float = 0.3,
-    view_half_width_m: float = 0.26,
+    picture: NDArray[np.uint8], pick_rule: PickRule, camera: Camera, flat_px: int
 ) -> int:
     """The next action of a rule that flips a handkerchief by rolling it over and pulling it out.
 
@@ -55,8 +51,8 @@ def scripted_flip_action(
     Args:
         picture: u8[H, H, 3], an observation.
         pick_rule: the environment's.
-        cloth_size_m: the environment's.
-        view_half_width_m: the environment's.
+        camera: that took the picture.
+        flat_px: pixels that the flat cloth would cover.
 
     Returns:
         Pick point * 6 + drop point.
@@ -66,9 +62,7 @@ def scripted_flip_action(
         ValueError: it is not a picture in colour.
     """
     find_pick_points, _ = PICK_RULES[pick_rule]
-    camera = Camera(len(picture), view_half_width_m)
     picks_px = find_pick_points(picture).astype(np.float64) + 0.5
-    flat_px = (cloth_size_m * camera.px_per_m) ** 2
     if red_mask(picture).sum() >= SUCCESS_PORTION * flat_px:
         return _shortest_carry(picks_px, _drop_points_px(camera))
     return _roll_or_pull(picks_px, cloth_mask(picture), camera)

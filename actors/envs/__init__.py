@@ -5,43 +5,109 @@
 | `clothbus/Reaching-v0` | n-DOF reaching | chapters 3.2, 4.2 |
 | `clothbus/HandkerchiefFlip36-v0` | handkerchief flipping, 6 pick x 6 drop points | chapter 3.3.1 |
 | `clothbus/HandkerchiefFlip60-v0` | the same, 10 x 6, after 3 random actions | chapter 4.3.1 |
+| `clothbus/TShirtFold-v0` | t-shirt folding, 10 pick x 20 drop points | chapter 3.3.2 |
+| `clothbus/ShirtFold-v0` | shirt folding along 6 lines | chapter 4.3.2 |
+| `clothbus/TrousersFold-v0` | trousers folding along 6 lines | chapter 4.3.2 |
+| `clothbus/HandkerchiefFold-v0` | handkerchief folding up, right, left; 32 x 32 | appendix |
 
 Every `info` holds `success` (bool) and `guard` (None, or why the step must not be learned from).
 """
 
 import inspect
-from typing import Any, SupportsIndex
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Final, SupportsIndex
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions
+from actors.envs.fold_lines import FoldLinesEnv
 from actors.envs.handkerchief import HandkerchiefFlipEnv
 from actors.envs.reaching import ReachingEnv
+from actors.envs.tshirt import VIEW_HALF_WIDTH_M as TSHIRT_VIEW_M
+from actors.envs.tshirt import TshirtFoldEnv
 
-__all__ = ["ENV_IDS", "ClothbusEnv", "HandkerchiefFlipEnv", "ReachingEnv", "make_env"]
+__all__ = [
+    "ENV_IDS",
+    "ClothTaskEnv",
+    "ClothTaskOptions",
+    "ClothbusEnv",
+    "FoldLinesEnv",
+    "HandkerchiefFlipEnv",
+    "ReachingEnv",
+    "TshirtFoldEnv",
+    "make_env",
+]
 
 ClothbusEnv = gymnasium.Env[NDArray[np.uint8], SupportsIndex]
 
-_TASKS: dict[str, tuple[type[ClothbusEnv], dict[str, Any]]] = {
-    "clothbus/Reaching-v0": (ReachingEnv, {}),
-    "clothbus/HandkerchiefFlip36-v0": (HandkerchiefFlipEnv, {"pick_rule": "grid"}),
-    "clothbus/HandkerchiefFlip60-v0": (
-        HandkerchiefFlipEnv,
-        {"pick_rule": "contour", "random_actions_at_start": 3},
+
+@dataclass(frozen=True)
+class _Task:
+    """An environment's class and what its id fixes; the rest are the class's defaults."""
+
+    env_class: type[ClothbusEnv]
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Of `ClothTaskOptions`."""
+
+    def known(self) -> list[str]:
+        """Names of all keywords that a call takes."""
+        own = [name for name in inspect.signature(self.env_class).parameters if name != "options"]
+        return own + [option.name for option in fields(ClothTaskOptions) if self._is_cloth()]
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The class's: gymnasium asks whoever makes an environment for it."""
+        return self.env_class.metadata
+
+    def __call__(self, **given: Any) -> ClothbusEnv:
+        """The environment; keywords are the class's arguments and options side by side."""
+        own = {name: given.pop(name) for name in list(given) if not self._is_option(name)}
+        if self._is_cloth():
+            own["options"] = ClothTaskOptions(**{**self.options, **given})
+        return self.env_class(**{**self.arguments, **own})
+
+    def _is_cloth(self) -> bool:
+        return issubclass(self.env_class, ClothTaskEnv)
+
+    def _is_option(self, name: str) -> bool:
+        return self._is_cloth() and name in ClothTaskOptions.__dataclass_fields__
+
+
+_TASKS: Final[Mapping[str, _Task]] = {
+    "clothbus/Reaching-v0": _Task(ReachingEnv),
+    "clothbus/HandkerchiefFlip36-v0": _Task(HandkerchiefFlipEnv, {"pick_rule": "grid"}),
+    "clothbus/HandkerchiefFlip60-v0": _Task(
+        HandkerchiefFlipEnv, {"pick_rule": "contour"}, {"initial_state": "random"}
+    ),
+    "clothbus/TShirtFold-v0": _Task(
+        TshirtFoldEnv, {}, {"horizon": 8, "view_half_width_m": TSHIRT_VIEW_M}
+    ),
+    "clothbus/ShirtFold-v0": _Task(
+        FoldLinesEnv, {"garment": "shirt"}, {"horizon": 3, "view_half_width_m": 0.32}
+    ),
+    "clothbus/TrousersFold-v0": _Task(
+        FoldLinesEnv, {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}
+    ),
+    "clothbus/HandkerchiefFold-v0": _Task(
+        FoldLinesEnv, {"garment": "handkerchief"}, {"horizon": 2, "observation_px": 32}
     ),
 }
 
-ENV_IDS = tuple(_TASKS)
+ENV_IDS: Final = tuple(_TASKS)
 """The ids that `make_env` knows."""
 
 
-def make_env(env_id: str, **kwargs: Any) -> ClothbusEnv:
+def make_env(env_id: str, **given: Any) -> ClothbusEnv:
     """A task, without gymnasium's wrappers: the tasks themselves refuse what is out of the rule.
 
     Args:
         env_id: one of `ENV_IDS`.
-        **kwargs: arguments of the task's class, where they differ from its defaults.
+        **given: arguments of the task's class and, for cloth, fields of `ClothTaskOptions`, where
+            they differ from the task's defaults.
 
     Raises:
         ValueError: there is no such task, or it has no such argument, or an argument is out of
@@ -52,27 +118,20 @@ def make_env(env_id: str, **kwargs: Any) -> ClothbusEnv:
             f"environment id: expected one of {', '.join(ENV_IDS)}; got {env_id!r}; "
             "name one of them"
         )
-    task, _ = _TASKS[env_id]
-    known = list(inspect.signature(task).parameters)
-    unknown = sorted(set(kwargs) - set(known))
-    if unknown:
+    known = _TASKS[env_id].known()
+    if unknown := sorted(set(given) - set(known)):
         raise ValueError(
             f"{env_id}: expected some of the arguments {', '.join(known)}; got "
             f"{', '.join(unknown)}; leave out what this task lacks"
         )
-    env: ClothbusEnv = gymnasium.make(env_id, disable_env_checker=True, **kwargs)
+    env: ClothbusEnv = gymnasium.make(env_id, disable_env_checker=True, **given)
     return env
 
 
 def _register() -> None:
-    for env_id, (task, defaults) in _TASKS.items():
+    for env_id, task in _TASKS.items():
         if env_id not in gymnasium.registry:
-            gymnasium.register(
-                env_id,
-                entry_point=f"{task.__module__}:{task.__name__}",
-                order_enforce=False,
-                kwargs=dict(defaults),
-            )
+            gymnasium.register(env_id, entry_point=task, order_enforce=False)
 
 
 _register()

@@ -23,6 +23,11 @@ class EpisodeClock:
         self.horizon = horizon
         self._remaining_steps = 0
 
+    @property
+    def steps_done(self) -> int:
+        """Steps counted since the episode began; the horizon where none is running."""
+        return self.horizon - self._remaining_steps
+
     def start(self) -> None:
         """Begin an episode."""
         self._remaining_steps = self.horizon

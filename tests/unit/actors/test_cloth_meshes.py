@@ -1,9 +1,7 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from actors.cloth.meshes import ClothMesh, edge_lengths_m, rectangular_sheet, write_obj
+from actors.cloth.meshes import ClothMesh, edge_lengths_m, rectangular_sheet
 
 
 def _areas_m2(mesh: ClothMesh) -> np.ndarray:
@@ -43,16 +41,6 @@ def test_edge_lengths_follow_the_vertices() -> None:
     np.testing.assert_allclose(
         edge_lengths_m(2 * mesh.vertices_m, mesh.edges), 2 * mesh.rest_edge_lengths_m
     )
-
-
-def test_an_obj_file_holds_the_mesh(tmp_path: Path) -> None:
-    mesh = rectangular_sheet(5, 0.3)
-    write_obj(mesh, tmp_path / "cloth.obj")
-    words = [line.split() for line in (tmp_path / "cloth.obj").read_text().splitlines()]
-    vertices = np.array([w[1:] for w in words if w[0] == "v"], dtype=float)
-    faces = np.array([w[1:] for w in words if w[0] == "f"], dtype=int)
-    np.testing.assert_allclose(vertices, mesh.vertices_m, atol=1e-9)
-    np.testing.assert_array_equal(faces - 1, mesh.faces)
 
 
 @pytest.mark.parametrize(("n", "size_m"), [(1, 0.3), (12, 0.0), (12, float("nan"))])

@@ -11,7 +11,8 @@ import pytest
 from actors.cloth import pybullet_engine
 from actors.cloth.engine import ClothEngine, ClothEngineError
 from actors.cloth.engines import make_engine
-from actors.cloth.gripper import grasped_vertices
+from actors.cloth.gestures import Gesture, Hand, pick_and_drop
+from actors.cloth.grasps import grasped_vertices
 from actors.cloth.guard import guard
 from actors.cloth.meshes import rectangular_sheet
 from actors.cloth.pybullet_engine import PyBulletEngine
@@ -20,6 +21,7 @@ from actors.cloth.pybullet_settings import PyBulletSettings
 from actors.cloth.quiet_pybullet import pybullet
 
 SHEET = rectangular_sheet(12, 0.3)
+LIFT = Gesture((Hand(np.array([0]), np.array([[0.0, 0.0, 0.1]])),))
 REPOSITORY = Path(pybullet_engine.__file__).resolve().parents[2]
 
 
@@ -39,8 +41,8 @@ def apart() -> Iterator[PyBulletProcessEngine]:
 
 def _fold(engine: ClothEngine) -> np.ndarray:
     """The left edge carried to the right."""
-    grasped = grasped_vertices(engine.vertices_in_world(), (-0.14, 0.0))
-    engine.pick_and_drop(grasped, (0.12, 0.0))
+    vertices = engine.vertices_in_world()
+    engine.perform(pick_and_drop(vertices, grasped_vertices(vertices, (-0.14, 0.0)), (0.12, 0.0)))
     return engine.vertices_in_world()
 
 
@@ -65,6 +67,19 @@ def test_a_grasped_edge_is_carried_over_and_let_go(engine: PyBulletEngine) -> No
     assert guard(SHEET, vertices) is None
     assert vertices[:, 2].max() < 0.08
     assert np.abs(vertices - SHEET.vertices_m).max() > 0.1
+
+
+def test_two_hands_carry_an_edge(engine: PyBulletEngine) -> None:
+    engine.reset(SHEET)
+    hands = []
+    for corner in (0, 132):  # the left edge's ends
+        y_m = SHEET.vertices_m[corner, 1]
+        hands.append(Hand(np.array([corner]), np.array([(0.0, y_m, 0.12), (0.12, y_m, 0.03)])))
+    engine.perform(Gesture(tuple(hands)))
+    vertices = engine.vertices_in_world()
+    assert guard(SHEET, vertices) is None
+    assert vertices[[0, 132], 0].min() > 0.07
+    assert np.ptp(vertices[:, 1]) > 0.27
 
 
 def test_the_gripper_lets_go_even_when_the_carrying_fails(
@@ -104,7 +119,7 @@ def test_an_engine_without_cloth_says_so(
     with pytest.raises(ClothEngineError, match=r"expected reset\(\) first"):
         engine.vertices_in_world()
     with pytest.raises(ClothEngineError, match=r"expected reset\(\) first"):
-        engine.pick_and_drop(np.array([0]), (0.0, 0.0))
+        engine.perform(LIFT)
     engine.close()
     engine.close()
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from actors.cloth.camera import Camera
 from actors.cloth.masks import cloth_mask, red_mask
 from actors.cloth.meshes import rectangular_sheet
-from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, draw_cloth
+from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Light, draw_cloth
 
 CAMERA = Camera()
 SHEET = rectangular_sheet(12, 0.3)
@@ -112,7 +112,37 @@ def test_the_camera_finds_table_points_again() -> None:
     for point_m in [(0.0, 0.0), (0.12, -0.09), (-0.26, 0.26)]:
         x_px, y_px = CAMERA.project_px(np.array([*point_m, 0.0]))
         assert CAMERA.table_point_m((x_px, y_px)) == pytest.approx(point_m)
-    assert CAMERA.project_px(np.array([-0.26, 0.26, 0.0])).tolist() == [0.0, 0.0]
+    corner = CAMERA.project_px(np.array([-0.26, 0.26, 0.0]))
+    np.testing.assert_allclose(corner, [0.0, 0.0], atol=1e-9)
+
+
+def test_an_oblique_turned_camera_finds_table_points_again() -> None:
+    camera = Camera(x_m=0.1, y_m=-0.4, target_x_m=0.02, target_y_m=0.03, roll_rad=0.2)
+    points_m = np.array([(0.0, 0.0), (0.12, -0.09), (-0.2, 0.2), (0.02, 0.03)])
+    points_px = camera.project_px(np.concatenate([points_m, np.zeros((4, 1))], axis=1))
+    np.testing.assert_allclose(camera.table_points_m(points_px), points_m, atol=1e-12)
+    np.testing.assert_allclose(points_px[3], [42.0, 42.0])
+    rotation = camera.rotation_from_world
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    seen = camera.intrinsics @ rotation @ (np.array([0.1, 0.1, 0.05]) - camera.position_in_world)
+    expected = camera.project_px(np.array([0.1, 0.1, 0.05]))
+    np.testing.assert_allclose(seen[:2] / seen[2], expected)
+
+
+def test_paint_and_light_change_the_colours_alone() -> None:
+    paint = np.tile(np.array([10, 200, 90], np.uint8), (len(SHEET.faces), 1))
+    usual = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA)
+    painted = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA, front_paint=paint)
+    dark = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA, light=Light(strength=0.5))
+    cloth = cloth_mask(usual)
+    assert (painted[~cloth] == usual[~cloth]).all()
+    assert (painted[cloth] != usual[cloth]).any(axis=1).all()
+    np.testing.assert_allclose(dark, usual // 2, atol=1)
+    with pytest.raises(ValueError, match=r"Light\.direction: expected a direction upwards"):
+        Light(direction=(1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match=r"expected ambient from 0 to 1 and strength from 0\.2"):
+        Light(strength=3.0)
 
 
 @pytest.mark.parametrize("name", ["size_px", "view_half_width_m", "height_m"])

@@ -8,7 +8,8 @@ import pytest
 from actors.cloth import xpbd_engine
 from actors.cloth.engine import ClothEngine, ClothEngineError
 from actors.cloth.engines import make_engine
-from actors.cloth.gripper import grasped_vertices
+from actors.cloth.gestures import Gesture, Hand, pick_and_drop
+from actors.cloth.grasps import grasped_vertices
 from actors.cloth.guard import GuardReason, guard
 from actors.cloth.meshes import edge_lengths_m, rectangular_sheet
 from actors.cloth.xpbd_constraints import distance_constraints
@@ -16,6 +17,7 @@ from actors.cloth.xpbd_engine import XpbdEngine
 from actors.cloth.xpbd_settings import XpbdSettings
 
 SHEET = rectangular_sheet(20, 0.3)
+LIFT = Gesture((Hand(np.array([0]), np.array([[0.0, 0.0, 0.1]])),))
 
 
 @pytest.fixture
@@ -27,8 +29,8 @@ def engine() -> XpbdEngine:
 
 def _fold(engine: ClothEngine) -> np.ndarray:
     """The left edge carried to the right."""
-    grasped = grasped_vertices(engine.vertices_in_world(), (-0.15, 0.0))
-    engine.pick_and_drop(grasped, (0.12, 0.0))
+    vertices = engine.vertices_in_world()
+    engine.perform(pick_and_drop(vertices, grasped_vertices(vertices, (-0.15, 0.0)), (0.12, 0.0)))
     return engine.vertices_in_world()
 
 
@@ -37,7 +39,9 @@ def _crumple(engine: ClothEngine, actions: int) -> np.ndarray:
     for _ in range(actions):
         vertices = engine.vertices_in_world()
         pick_xy_m = vertices[generator.integers(len(vertices)), :2]
-        engine.pick_and_drop(grasped_vertices(vertices, pick_xy_m), generator.uniform(-0.1, 0.1, 2))
+        x_m, y_m = generator.uniform(-0.1, 0.1, 2)
+        grasped = grasped_vertices(vertices, (pick_xy_m[0], pick_xy_m[1]))
+        engine.perform(pick_and_drop(vertices, grasped, (x_m, y_m)))
     return engine.vertices_in_world()
 
 
@@ -61,13 +65,34 @@ def test_an_edge_carried_over_stays_there_in_a_second_layer(engine: XpbdEngine) 
     assert vertices[:, 2].max() < 0.1
 
 
+def test_two_hands_fold_one_half_over_the_other(engine: XpbdEngine) -> None:
+    vertices = engine.vertices_in_world()
+    corners = [np.array([0]), np.array([380])]  # the left edge's ends
+    stations = [
+        np.array(
+            [
+                (0.15 * (k / 8 * 2 - 1), vertices[corner[0], 1], 0.1 * np.sin(np.pi * k / 8) + 0.02)
+                for k in range(1, 9)
+            ]
+        )
+        for corner in corners
+    ]
+    engine.perform(Gesture(tuple(Hand(*pair) for pair in zip(corners, stations, strict=True))))
+    folded = engine.vertices_in_world()
+    assert guard(SHEET, folded) is None
+    left_edge = folded[SHEET.vertices_m[:, 0] < -0.149]
+    assert left_edge[:, 0].min() > 0.08
+    assert np.ptp(folded[:, 0]) < 0.2
+    assert np.ptp(folded[:, 1]) > 0.28
+
+
 def test_crumpled_cloth_keeps_its_lengths_and_its_layers_apart(engine: XpbdEngine) -> None:
     vertices = _crumple(engine, 8)
     stretch = edge_lengths_m(vertices, SHEET.edges) / SHEET.rest_edge_lengths_m
     assert np.quantile(stretch, 0.95) < 1.1
     assert stretch.max() < 1.5
     constraints = distance_constraints(SHEET, XpbdSettings())
-    thickness_m = 0.8 * constraints.spacing_m
+    thickness_m = 0.8 * SHEET.spacing_m
     distances_m = np.linalg.norm(vertices[:, None] - vertices, axis=-1)
     for vertex, (first, last) in enumerate(
         zip(constraints.first_neighbour, constraints.first_neighbour[1:], strict=False)
@@ -136,7 +161,7 @@ def test_an_engine_without_cloth_says_so() -> None:
     for use in (
         engine.vertices_in_world,
         engine.save,
-        lambda: engine.pick_and_drop(np.array([0]), (0.0, 0.0)),
+        lambda: engine.perform(LIFT),
     ):
         with pytest.raises(ClothEngineError, match=r"expected reset\(\) first"):
             use()
@@ -148,7 +173,7 @@ def test_wrong_arguments_are_named(engine: XpbdEngine) -> None:
     with pytest.raises(ValueError, match=r"expected finite f64 \[400, 3\]; got \[9, 3\]"):
         engine.reset(SHEET, np.zeros((9, 3)))
     with pytest.raises(ValueError, match="expected ids from 0 to 399"):
-        engine.pick_and_drop(np.array([400]), (0.0, 0.0))
+        engine.perform(Gesture((Hand(np.array([400]), np.zeros((1, 3))),)))
     with pytest.raises(ValueError, match="expected a finite number, more than 0; got 0"):
         make_engine("xpbd", {"substeps_per_sec": 0})
     with pytest.raises(ValueError, match="engine settings of xpbd: expected some of"):
@@ -157,8 +182,9 @@ def test_wrong_arguments_are_named(engine: XpbdEngine) -> None:
 
 def test_constraints_of_a_sheet_are_its_threads_diagonals_and_bends() -> None:
     settings = XpbdSettings(stretch_compliance=1e-9)
-    constraints = distance_constraints(rectangular_sheet(4, 0.3), settings)
+    sheet = rectangular_sheet(4, 0.3)
+    constraints = distance_constraints(sheet, settings)
     kinds = [settings.stretch_compliance, settings.shear_compliance, settings.bending_compliance]
     assert [int((constraints.compliances == kind).sum()) for kind in kinds] == [24, 18, 20]
-    assert constraints.spacing_m == pytest.approx(0.1)
+    assert sheet.spacing_m == pytest.approx(0.1)
     assert len({tuple(pair) for pair in constraints.pairs.tolist()}) == 62

@@ -1,6 +1,7 @@
 import os
 import signal
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,12 +11,22 @@ from actors.cloth.engine import ClothEngineError
 from actors.cloth.masks import cloth_mask, red_mask
 from actors.cloth.pybullet_process import PyBulletProcessEngine
 from actors.demonstrate.scripted import scripted_flip_action
-from actors.envs import HandkerchiefFlipEnv, make_env
+from actors.envs import ClothTaskOptions, HandkerchiefFlipEnv, make_env
+from actors.envs.handkerchief import PickRule
+
+
+def make(
+    pick_rule: PickRule = "grid", reward_scale: float = 1.0, **options: Any
+) -> HandkerchiefFlipEnv:
+    return HandkerchiefFlipEnv(
+        pick_rule, reward_scale=reward_scale, options=ClothTaskOptions(**options)
+    )
 
 
 @pytest.fixture
 def env() -> Iterator[HandkerchiefFlipEnv]:
-    env = HandkerchiefFlipEnv("grid", horizon=2)
+    """With the engine in a process of its own, which can be lost."""
+    env = make(horizon=2, engine="pybullet")
     yield env
     env.close()
 
@@ -30,7 +41,7 @@ def test_random_starts_depend_on_the_seed_alone() -> None:
     def start(seed: int) -> np.ndarray:
         env = make_env(
             "clothbus/HandkerchiefFlip60-v0",
-            random_actions_at_start=1,
+            initial_state="folded_over",
             start_shift_m=0.02,
             start_turn_rad=0.3,
         )
@@ -52,7 +63,7 @@ def test_an_episode_begins_green_and_flat(env: HandkerchiefFlipEnv) -> None:
 
 
 def test_reward_is_the_red_portion_of_the_picture() -> None:
-    env = HandkerchiefFlipEnv("grid", horizon=2, reward_scale=3.0)
+    env = make(horizon=2, reward_scale=3.0)
     env.reset(seed=0)
     picture, reward, terminated, truncated, info = env.step(2 * 6 + 3)
     env.close()
@@ -65,12 +76,14 @@ def test_reward_is_the_red_portion_of_the_picture() -> None:
     assert column > 42 > row
 
 
-def test_the_scripted_rule_flips_the_cloth() -> None:
-    env = HandkerchiefFlipEnv("grid", horizon=8)
+@pytest.mark.parametrize("engine", ["pybullet", "xpbd"])
+def test_the_scripted_rule_flips_the_cloth(engine: str) -> None:
+    env = make(horizon=8, engine=engine)
     picture, info = env.reset(seed=0)
     truncated = False
     while not (truncated or info["success"]):
-        picture, _, _, truncated, info = env.step(scripted_flip_action(picture, "grid"))
+        action = scripted_flip_action(picture, "grid", env.camera, env.flat_px)
+        picture, _, _, truncated, info = env.step(action)
     env.close()
     assert info["success"]
     assert info["red_over_flat"] >= 0.8
@@ -86,7 +99,7 @@ def test_the_horizon_truncates_and_a_new_episode_is_needed(env: HandkerchiefFlip
 
 def test_a_lost_simulator_truncates_the_episode(env: HandkerchiefFlipEnv) -> None:
     before, _ = env.reset(seed=0)
-    engine = env._engine
+    engine = env._scene._engine
     assert isinstance(engine, PyBulletProcessEngine)
     assert engine.process_id is not None
     os.kill(engine.process_id, signal.SIGKILL)
@@ -101,7 +114,7 @@ def test_a_lost_simulator_truncates_the_episode(env: HandkerchiefFlipEnv) -> Non
 
 
 def test_an_exploding_cloth_truncates_the_episode() -> None:
-    env = HandkerchiefFlipEnv("grid", engine_settings={"time_step_secs": 1 / 100})
+    env = make(engine="pybullet", engine_settings={"time_step_secs": 1 / 100})
     before, _ = env.reset(seed=0)
     while True:
         picture, reward, _, truncated, info = env.step(14)
@@ -115,7 +128,7 @@ def test_an_exploding_cloth_truncates_the_episode() -> None:
 
 
 def test_an_engine_that_breaks_every_cloth_is_an_error() -> None:
-    env = HandkerchiefFlipEnv("grid", engine_settings={"time_step_secs": 1 / 20})
+    env = make(engine="pybullet", engine_settings={"time_step_secs": 1 / 20})
     with pytest.raises(ClothEngineError, match="expected a sound cloth within 5 attempts"):
         env.reset(seed=0)
     env.close()
@@ -137,11 +150,11 @@ def test_an_action_out_of_range_is_refused(env: HandkerchiefFlipEnv) -> None:
     [
         {"horizon": 0},
         {"engine": "mujoco"},
-        {"random_actions_at_start": -1},
+        {"initial_state": "crumpled"},
         {"reward_scale": 0.0},
         {"reward_scale": float("nan")},
-        {"cloth_size_m": 3.0},
-        {"vertices_per_side": 1},
+        {"randomisation": "some"},
+        {"spacing_m": 0.0},
         {"view_half_width_m": 0.0},
         {"start_shift_m": 1.0},
         {"start_turn_rad": -0.1},
@@ -151,9 +164,9 @@ def test_an_action_out_of_range_is_refused(env: HandkerchiefFlipEnv) -> None:
 )
 def test_arguments_out_of_the_rule_are_refused(argument: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=rf"{next(iter(argument))}: expected .*; got "):
-        HandkerchiefFlipEnv("grid", **argument)  # type: ignore[arg-type]
+        make(**argument)  # type: ignore[arg-type]
 
 
 def test_an_unknown_pick_rule_is_refused() -> None:
     with pytest.raises(ValueError, match="pick_rule: expected 'grid' or 'contour'; got 'corner'"):
-        HandkerchiefFlipEnv("corner")  # type: ignore[arg-type]
+        make("corner")  # type: ignore[arg-type]

@@ -1,0 +1,98 @@
+"""Folding shirts and trousers along lines, and the handkerchief of the appendix."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from actors.cloth.fold_lines import N_FOLD_LINES, fold, plan_fold
+from actors.cloth.garments import GarmentKind
+from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours
+from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions, PlannedAction
+from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
+
+
+@dataclass(frozen=True)
+class FoldTask:
+    """A garment and how it is folded well."""
+
+    kind: GarmentKind
+    lines: tuple[int, ...]
+    """The lines that may be chosen, by action; see `actors.cloth.fold_lines`."""
+
+    script: tuple[int, ...]
+    """The actions of the scripted expert, in order: they make the target."""
+
+    thresholds: FoldThresholds
+    colours: ClothColours
+
+
+ALL_LINES: Final = tuple(range(N_FOLD_LINES))
+SHIRT_COLOURS: Final = ClothColours(front=(60, 90, 190), back=(150, 180, 235))
+TROUSERS_COLOURS: Final = ClothColours(front=(150, 90, 40), back=(215, 170, 110))
+
+FOLD_TASKS: Final[Mapping[str, FoldTask]] = {
+    "shirt": FoldTask("shirt", ALL_LINES, (0, 2, 4), FoldThresholds(0.8, 0.03), SHIRT_COLOURS),
+    "trousers": FoldTask(
+        "trousers", ALL_LINES, (1, 4), FoldThresholds(0.8, 0.03), TROUSERS_COLOURS
+    ),
+    "handkerchief": FoldTask(
+        "handkerchief", (4, 1, 2), (0, 1), FoldThresholds(0.8, 0.03), HANDKERCHIEF_COLOURS
+    ),
+}
+"""By name. The handkerchief's lines fold up, right and left; its target is up, then right."""
+
+
+class FoldLinesEnv(ClothTaskEnv):
+    """Folding along lines: `clothbus/ShirtFold-v0`, `TrousersFold-v0` and `HandkerchiefFold-v0`.
+
+    Action: which line; lines, grasp points and paths follow from the current outline, see
+    `actors.cloth.fold_lines`. Reward: the IoU with the target mask, wherever it lies.
+
+    Measures: `success` (IoU and mean particle distance within the task's thresholds), `iou`,
+    `particle_distance_m`; after a step `fold_line_m`, `grasps_m` and `drops_m`.
+
+    Source: table 4.4a; the appendix for the handkerchief. **assumed**: the reward, which the source
+    leaves out, and everything of the lines that `actors.cloth.fold_lines` says.
+    """
+
+    def __init__(self, garment: str, *, options: ClothTaskOptions | None = None) -> None:
+        """Make the task; see `ClothTaskEnv`.
+
+        Args:
+            garment: "shirt", "trousers" or "handkerchief".
+            options: what was chosen.
+
+        Raises:
+            ValueError: an argument is out of the rule.
+        """
+        if garment not in FOLD_TASKS:
+            raise ValueError(
+                f"garment: expected one of {', '.join(FOLD_TASKS)}; got {garment!r}; "
+                "name one of them"
+            )
+        self.task = FOLD_TASKS[garment]
+        super().__init__(
+            self.task.kind,
+            len(self.task.lines),
+            options or ClothTaskOptions(),
+            self.task.colours,
+            {"xpbd": FOLDING_XPBD},
+        )
+
+    def _plan(self, action: int) -> PlannedAction:
+        plan = plan_fold(self._scene.mask, self._scene.look.camera, self.task.lines[action])
+        return PlannedAction(
+            fold(self._scene.vertices_in_world(), plan),
+            {"fold_line_m": plan.line_m, "grasps_m": plan.grasps_m, "drops_m": plan.drops_m},
+        )
+
+    def _judge(self) -> tuple[float, dict[str, Any]]:
+        iou = self._target().iou(self._scene.mask, self._scene.look.camera)
+        distance_m = self._target().distance_m(self._scene.vertices_in_world())
+        thresholds = self.task.thresholds
+        folded = iou >= thresholds.least_iou and distance_m <= thresholds.most_distance_m
+        return iou, {"success": folded, "iou": iou, "particle_distance_m": distance_m}
+
+    def _target(self) -> FoldTarget:
+        lines = [self.task.lines[action] for action in self.task.script]
+        return scripted_target(self._scene.garment, lines)
