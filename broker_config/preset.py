@@ -316,14 +316,15 @@ def _apply(table: dict[str, object], override: str) -> None:
         if not isinstance(child, dict):
             raise PresetError(f"override {override!r}: {parent} is a value, not a table")
         table = child
-    table[name] = _toml_value(literal.strip())
+    table[name] = toml_value(literal.strip())
 
 
-def _toml_value(literal: str) -> object:
+def toml_value(literal: str) -> object:
+    """What is written after `key=` on a command line: a TOML value, or else plain text."""
     try:
         return tomllib.loads(f"value = {literal}")["value"]
     except tomllib.TOMLDecodeError:
-        return literal  # an unquoted word on the command line is meant as text
+        return literal
 
 
 def with_seed(preset: Preset, seed: int) -> Preset:

@@ -15,6 +15,7 @@ from broker_config.heart import HUNG_SECS
 from broker_config.messages import Command
 from broker_config.preset import Preset
 from broker_config.session import DEFAULT_ADDRESS
+from deploy import task_commands
 from deploy.priority import Priority
 from deploy.process import (
     CONFIGURATION_EXIT,
@@ -390,6 +391,10 @@ def collect(
             f"return {trajectory.return_:.2f}, {'success' if trajectory.success else 'no success'}",
             highlight=False,
         )
+
+
+app.command(name="task")(task_commands.task)
+app.command(name="watch")(task_commands.watch)
 
 
 def _require_evaluable(episodes: int, in_process: bool) -> None:

@@ -21,6 +21,9 @@ T = TypeVar("T")
 PARENT_VARIABLE = "CLOTHBUS_PARENT_PID"
 """Set by a supervisor: the process ends when this parent does, however the parent ends."""
 
+FAILED_CHECK_EXIT = 1
+"""Exit code when what was tested does not hold."""
+
 CONFIGURATION_EXIT = 3
 """Exit code of an error that a restart would only repeat."""
 

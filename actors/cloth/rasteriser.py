@@ -47,6 +47,17 @@ HANDKERCHIEF_COLOURS = ClothColours()
 """Green in front, red behind."""
 
 
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Colours of a cloth that are not everywhere the same: prints and markers."""
+
+    front: NDArray[np.uint8]
+    """u8[F, 3], of each face's front side."""
+
+    back: NDArray[np.uint8]
+    """u8[F, 3], of each face's back side."""
+
+
 @dataclass(frozen=True)
 class Light:
     """A far lamp and what the room throws back."""
@@ -94,7 +105,7 @@ def draw_cloth(
     camera: Camera,
     colours: ClothColours = HANDKERCHIEF_COLOURS,
     *,
-    front_paint: NDArray[np.uint8] | None = None,
+    paint: Paint | None = None,
     light: Light = DAYLIGHT,
 ) -> NDArray[np.uint8]:
     """The camera's picture of cloth on the table.
@@ -104,8 +115,7 @@ def draw_cloth(
         faces: i32[F, 3], vertex ids, counter-clockwise seen from the front side.
         camera: from where.
         colours: of the cloth's two sides and of the table.
-        front_paint: u8[F, 3], the colour of each face's front side, where it is not everywhere the
-            same: prints and markers.
+        paint: colours face by face, in place of those of the two sides.
         light: from where and how bright.
 
     Returns:
@@ -120,8 +130,9 @@ def draw_cloth(
     front_seen = (
         _twice_area(*(corners[faces[:, k]] for k in range(3))) < 0
     )  # the picture's y is down
-    fronts = np.array(colours.front) if front_paint is None else front_paint
-    plain = np.where(front_seen[:, None], fronts, colours.back)
+    fronts = np.array(colours.front) if paint is None else paint.front
+    backs = np.array(colours.back) if paint is None else paint.back
+    plain = np.where(front_seen[:, None], fronts, backs)
     brightness = light.brightness(_seen_normals(vertices_in_world, faces, front_seen))
     shaded = np.minimum(np.floor(plain * brightness[:, None]), 255).astype(np.uint8)
     picture = np.empty((camera.size_px, camera.size_px, 3), dtype=np.uint8)

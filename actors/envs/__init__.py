@@ -14,7 +14,7 @@ Every `info` holds `success` (bool) and `guard` (None, or why the step must not 
 """
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final, SupportsIndex
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions
+from actors.envs.difficulties import FOLDING, TSHIRT, Difficulty, check_difficulty
 from actors.envs.fold_lines import FoldLinesEnv
 from actors.envs.handkerchief import HandkerchiefFlipEnv
 from actors.envs.reaching import ReachingEnv
@@ -50,50 +51,67 @@ class _Task:
 
     env_class: type[ClothbusEnv]
     arguments: Mapping[str, Any] = field(default_factory=dict)
-    options: Mapping[str, Any] = field(default_factory=dict)
-    """Of `ClothTaskOptions`."""
-
-    def known(self) -> list[str]:
-        """Names of all keywords that a call takes."""
-        own = [name for name in inspect.signature(self.env_class).parameters if name != "options"]
-        return own + [option.name for option in fields(ClothTaskOptions) if self._is_cloth()]
 
     @property
     def metadata(self) -> dict[str, Any]:
         """The class's: gymnasium asks whoever makes an environment for it."""
         return self.env_class.metadata
 
+    def known(self) -> list[str]:
+        """Names of all keywords that a call takes."""
+        return list(inspect.signature(self.env_class).parameters)
+
     def __call__(self, **given: Any) -> ClothbusEnv:
-        """The environment; keywords are the class's arguments and options side by side."""
-        own = {name: given.pop(name) for name in list(given) if not self._is_option(name)}
-        if self._is_cloth():
-            own["options"] = ClothTaskOptions(**{**self.options, **given})
-        return self.env_class(**{**self.arguments, **own})
+        """The environment."""
+        make: Callable[..., ClothbusEnv] = self.env_class
+        return make(**{**self.arguments, **given})
 
-    def _is_cloth(self) -> bool:
-        return issubclass(self.env_class, ClothTaskEnv)
 
-    def _is_option(self, name: str) -> bool:
-        return self._is_cloth() and name in ClothTaskOptions.__dataclass_fields__
+@dataclass(frozen=True)
+class _ClothTask(_Task):
+    """A cloth task: keywords are its class's arguments and fields of `ClothTaskOptions`."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    difficulties: Mapping[Difficulty, Mapping[str, Any]] = field(default_factory=dict)
+    """Further options, where the task has difficulties."""
+
+    def known(self) -> list[str]:
+        """Names of all keywords that a call takes."""
+        own = [name for name in super().known() if name != "options"]
+        own += ["difficulty"] if self.difficulties else []
+        return own + [option.name for option in fields(ClothTaskOptions)]
+
+    def __call__(self, **given: Any) -> ClothbusEnv:
+        """The environment."""
+        further: Mapping[str, Any] = {}
+        if self.difficulties:
+            difficulty = given.pop("difficulty", "medium")
+            check_difficulty(difficulty)
+            further = self.difficulties[difficulty]
+        is_option = ClothTaskOptions.__dataclass_fields__.__contains__
+        own = {name: given.pop(name) for name in list(given) if not is_option(name)}
+        return super().__call__(
+            **own, options=ClothTaskOptions(**{**self.options, **further, **given})
+        )
 
 
 _TASKS: Final[Mapping[str, _Task]] = {
     "clothbus/Reaching-v0": _Task(ReachingEnv),
-    "clothbus/HandkerchiefFlip36-v0": _Task(HandkerchiefFlipEnv, {"pick_rule": "grid"}),
-    "clothbus/HandkerchiefFlip60-v0": _Task(
+    "clothbus/HandkerchiefFlip36-v0": _ClothTask(HandkerchiefFlipEnv, {"pick_rule": "grid"}),
+    "clothbus/HandkerchiefFlip60-v0": _ClothTask(
         HandkerchiefFlipEnv, {"pick_rule": "contour"}, {"initial_state": "random"}
     ),
-    "clothbus/TShirtFold-v0": _Task(
-        TshirtFoldEnv, {}, {"horizon": 8, "view_half_width_m": TSHIRT_VIEW_M}
+    "clothbus/TShirtFold-v0": _ClothTask(
+        TshirtFoldEnv, {}, {"horizon": 8, "view_half_width_m": TSHIRT_VIEW_M}, TSHIRT
     ),
-    "clothbus/ShirtFold-v0": _Task(
-        FoldLinesEnv, {"garment": "shirt"}, {"horizon": 3, "view_half_width_m": 0.32}
+    "clothbus/ShirtFold-v0": _ClothTask(
+        FoldLinesEnv, {"garment": "shirt"}, {"horizon": 3, "view_half_width_m": 0.32}, FOLDING
     ),
-    "clothbus/TrousersFold-v0": _Task(
-        FoldLinesEnv, {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}
+    "clothbus/TrousersFold-v0": _ClothTask(
+        FoldLinesEnv, {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}, FOLDING
     ),
-    "clothbus/HandkerchiefFold-v0": _Task(
-        FoldLinesEnv, {"garment": "handkerchief"}, {"horizon": 2, "observation_px": 32}
+    "clothbus/HandkerchiefFold-v0": _ClothTask(
+        FoldLinesEnv, {"garment": "handkerchief"}, {"horizon": 2, "observation_px": 32}, FOLDING
     ),
 }
 
@@ -106,8 +124,8 @@ def make_env(env_id: str, **given: Any) -> ClothbusEnv:
 
     Args:
         env_id: one of `ENV_IDS`.
-        **given: arguments of the task's class and, for cloth, fields of `ClothTaskOptions`, where
-            they differ from the task's defaults.
+        **given: arguments of the task's class and, for cloth, a `difficulty` and fields of
+            `ClothTaskOptions`, where they differ from the task's defaults.
 
     Raises:
         ValueError: there is no such task, or it has no such argument, or an argument is out of

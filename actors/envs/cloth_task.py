@@ -23,7 +23,7 @@ from actors.cloth.garments import (
 from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason
 from actors.cloth.masks import cloth_mask
-from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours
+from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Paint
 from actors.envs.arguments import check_range, check_render_mode, check_size, checked_action
 from actors.envs.episode_clock import EpisodeClock
 from actors.envs.initial_states import (
@@ -180,8 +180,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     def _begin(self) -> None:
         """Called when a garment was laid and before anything is judged: a task's own memory."""
 
-    def _front_paint(self, garment: Garment, colours: ClothColours) -> NDArray[np.uint8] | None:
-        """u8[F, 3], colours of the faces' front sides; None where all have the same."""
+    def _paint(self, garment: Garment, colours: ClothColours) -> Paint | None:
+        """Prints and markers; None where either side has one colour."""
         del garment, colours
         return None
 
@@ -301,7 +301,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         look = Look(
             self.camera,
             colours,
-            self._front_paint(garment, colours),
+            self._paint(garment, colours),
             self._conditions.light,
             self._randomisation.noise,
         )

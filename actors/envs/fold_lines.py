@@ -4,9 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.cloth.camera import Camera
 from actors.cloth.fold_lines import N_FOLD_LINES, fold, plan_fold
-from actors.cloth.garments import GarmentKind
-from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours
+from actors.cloth.garments import Garment, GarmentKind
+from actors.cloth.gestures import Gesture
+from actors.cloth.masks import cloth_mask
+from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, draw_cloth
 from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions, PlannedAction
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
 
@@ -26,14 +32,27 @@ class FoldTask:
     colours: ClothColours
 
 
+@dataclass(frozen=True)
+class FoldAlong:
+    """A step of a script: fold along a line of the current outline."""
+
+    line: int
+
+    def gesture(self, vertices_in_world: NDArray[np.float64], garment: Garment) -> Gesture:
+        """The fold, planned on a picture of twice the usual size."""
+        mask = cloth_mask(draw_cloth(vertices_in_world, garment.mesh.faces, _SHARP_EYE))
+        return fold(vertices_in_world, plan_fold(mask, _SHARP_EYE, self.line))
+
+
+_SHARP_EYE: Final = Camera(size_px=168, view_half_width_m=0.35)
 ALL_LINES: Final = tuple(range(N_FOLD_LINES))
 SHIRT_COLOURS: Final = ClothColours(front=(60, 90, 190), back=(150, 180, 235))
 TROUSERS_COLOURS: Final = ClothColours(front=(150, 90, 40), back=(215, 170, 110))
 
 FOLD_TASKS: Final[Mapping[str, FoldTask]] = {
-    "shirt": FoldTask("shirt", ALL_LINES, (0, 2, 4), FoldThresholds(0.8, 0.03), SHIRT_COLOURS),
+    "shirt": FoldTask("shirt", ALL_LINES, (0, 2, 4), FoldThresholds(0.85, 0.025), SHIRT_COLOURS),
     "trousers": FoldTask(
-        "trousers", ALL_LINES, (1, 4), FoldThresholds(0.8, 0.03), TROUSERS_COLOURS
+        "trousers", ALL_LINES, (1, 4), FoldThresholds(0.85, 0.025), TROUSERS_COLOURS
     ),
     "handkerchief": FoldTask(
         "handkerchief", (4, 1, 2), (0, 1), FoldThresholds(0.8, 0.03), HANDKERCHIEF_COLOURS
@@ -94,5 +113,5 @@ class FoldLinesEnv(ClothTaskEnv):
         return iou, {"success": folded, "iou": iou, "particle_distance_m": distance_m}
 
     def _target(self) -> FoldTarget:
-        lines = [self.task.lines[action] for action in self.task.script]
-        return scripted_target(self._scene.garment, lines)
+        script = tuple(FoldAlong(self.task.lines[action]) for action in self.task.script)
+        return scripted_target(self._scene.garment, script)

@@ -1,17 +1,16 @@
 """What a garment looks like when it is folded well: scripted folds, made on the fast engine."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
 from actors.cloth.engine import ClothEngineError
-from actors.cloth.fold_lines import fold, plan_fold
 from actors.cloth.garments import Garment
+from actors.cloth.gestures import Gesture
 from actors.cloth.guard import guard
 from actors.cloth.masks import cloth_mask
 from actors.cloth.measures import aligned_iou, mean_particle_distance_m
@@ -21,8 +20,6 @@ from actors.cloth.xpbd_settings import XpbdSettings
 
 FOLDING_XPBD: Final[dict[str, Any]] = {"table_friction": 1.0, "bending_compliance": 1e-4}
 """With less friction cloth slides under the fold; stiffer, small folds spring open."""
-
-_EYE: Final = Camera(size_px=168, view_half_width_m=0.35)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,31 +52,29 @@ class FoldThresholds:
     most_distance_m: float
 
 
-def scripted_target(garment: Garment, lines: Sequence[int]) -> FoldTarget:
-    """The garment after folds along lines of its current outline, from spread out.
+class FoldStep(Protocol):
+    """One step of a script: hashable, so that a target is made once."""
 
-    Args:
-        garment: laid flat in the middle of the table.
-        lines: which of the six, in order; see `actors.cloth.fold_lines`.
+    def gesture(self, vertices_in_world: NDArray[np.float64], garment: Garment) -> Gesture:
+        """What hands do to the garment as it lies now."""
+        ...
+
+
+@lru_cache(maxsize=64)
+def scripted_target(garment: Garment, script: tuple[FoldStep, ...]) -> FoldTarget:
+    """The garment after a script, from spread out in the middle of the table.
 
     Raises:
-        ClothEngineError: a fold broke the cloth.
+        ClothEngineError: a step broke the cloth.
     """
-    return _target(garment, tuple(lines))
-
-
-@lru_cache(maxsize=16)
-def _target(garment: Garment, lines: tuple[int, ...]) -> FoldTarget:
     engine = XpbdEngine(XpbdSettings(**FOLDING_XPBD))
     engine.reset(garment.mesh)
-    for line in lines:
-        vertices = engine.vertices_in_world()
-        mask = cloth_mask(draw_cloth(vertices, garment.mesh.faces, _EYE))
-        engine.perform(fold(vertices, plan_fold(mask, _EYE, line)))
+    for step in script:
+        engine.perform(step.gesture(engine.vertices_in_world(), garment))
     vertices = engine.vertices_in_world()
     if reason := guard(garment.mesh, vertices):
         raise ClothEngineError(
-            f"target of {garment.name}: expected a sound cloth after the folds {lines}; got "
-            f"{reason}; choose other lines, or a mesh with smaller triangles"
+            f"target of {garment.name}: expected a sound cloth after the script {script}; got "
+            f"{reason}; choose another script, or a mesh with smaller triangles"
         )
     return FoldTarget(garment, vertices)

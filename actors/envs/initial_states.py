@@ -27,7 +27,7 @@ INITIAL_STATES: Final[tuple[InitialState, ...]] = get_args(InitialState)
 
 RANDOM_ACTIONS: Final = 3
 CREASES: Final = 2
-CREASE_M: Final = (0.035, 0.055)
+CREASE_M: Final = (0.015, 0.03)
 ROTATED_RAD: Final = (float(np.deg2rad(20.0)), float(np.deg2rad(40.0)))
 SHIFTED_M: Final = (0.04, 0.06)
 

@@ -12,7 +12,7 @@ from actors.cloth.garments import Garment
 from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason, guard
 from actors.cloth.masks import cloth_mask
-from actors.cloth.rasteriser import DAYLIGHT, ClothColours, Light, draw_cloth
+from actors.cloth.rasteriser import DAYLIGHT, ClothColours, Light, Paint, draw_cloth
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,9 +21,7 @@ class Look:
 
     camera: Camera
     colours: ClothColours
-    front_paint: NDArray[np.uint8] | None = None
-    """u8[F, 3], the faces' own colours in front, or None."""
-
+    paint: Paint | None = None
     light: Light = DAYLIGHT
     noise: float = 0.0
     """Standard deviation of each channel of each pixel, of 255."""
@@ -41,7 +39,7 @@ class Look:
             garment.mesh.faces,
             camera or self.camera,
             self.colours,
-            front_paint=self.front_paint,
+            paint=self.paint,
             light=self.light,
         )
         if random is None or self.noise == 0.0:

@@ -1,16 +1,18 @@
 """Folding a t-shirt by picking it up and dropping it, with coloured markers at sleeves and hem."""
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.cloth.camera import Camera
 from actors.cloth.garments import Garment
-from actors.cloth.gestures import pick_and_drop
+from actors.cloth.gestures import Gesture, pick_and_drop
 from actors.cloth.grasps import grasped_vertices
 from actors.cloth.markers import TSHIRT_MARKERS, found_markers, painted
 from actors.cloth.pick_points import extreme_pick_points
-from actors.cloth.rasteriser import ClothColours
+from actors.cloth.rasteriser import ClothColours, Paint, draw_cloth
 from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions, PlannedAction
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
 from actors.envs.tshirt_reward import RewardForm, TshirtReward
@@ -29,11 +31,27 @@ DROP_POINTS_M: Final = tuple(
 algorithm 3's initial and target points of the hem."""
 
 N_PICK_POINTS: Final = 10
-TARGET_LINES: Final = (0, 2, 4)
-"""Left side in, right side in, hem up."""
+SCRIPT: Final = ((2, 7), (6, 7), (4, 2))
+"""Pick and drop points of a good fold: right sleeve in, left sleeve in, middle of the hem up."""
 
 COLOURS: Final = ClothColours(front=(50, 80, 190), back=(120, 150, 225))
-THRESHOLDS: Final = FoldThresholds(0.75, 0.04)
+THRESHOLDS: Final = FoldThresholds(0.75, 0.05)
+
+
+@dataclass(frozen=True)
+class PickAndDrop:
+    """A step of a script: from a pick point of the current picture to a drop point."""
+
+    pick: int
+    drop: int
+
+    def gesture(self, vertices_in_world: NDArray[np.float64], garment: Garment) -> Gesture:
+        """The step, planned on the task's usual picture."""
+        picture = draw_cloth(vertices_in_world, garment.mesh.faces, _EYE, COLOURS)
+        return _pick_and_drop(vertices_in_world, picture, _EYE, self.pick, self.drop)[0]
+
+
+_EYE: Final = Camera(view_half_width_m=VIEW_HALF_WIDTH_M)
 
 
 class TshirtFoldEnv(ClothTaskEnv):
@@ -70,19 +88,16 @@ class TshirtFoldEnv(ClothTaskEnv):
     def _begin(self) -> None:
         self._reward = TshirtReward(self._reward_form)
 
-    def _front_paint(self, garment: Garment, colours: ClothColours) -> NDArray[np.uint8]:
-        return painted(garment, colours.front, TSHIRT_MARKERS)
+    def _paint(self, garment: Garment, colours: ClothColours) -> Paint:
+        return painted(garment, colours, TSHIRT_MARKERS)
 
     def _plan(self, action: int) -> PlannedAction:
         pick, drop = divmod(action, len(DROP_POINTS_M))
-        column, row = extreme_pick_points(self._scene.picture)[pick].tolist()
-        pick_xy_m = self._scene.look.camera.table_point_m((column + 0.5, row + 0.5))
-        vertices = self._scene.vertices_in_world()
-        grasped = grasped_vertices(vertices, pick_xy_m)
-        return PlannedAction(
-            pick_and_drop(vertices, grasped, DROP_POINTS_M[drop]),
-            {"pick_px": (column, row), "drop_xy_m": DROP_POINTS_M[drop]},
+        scene = self._scene
+        gesture, pick_px = _pick_and_drop(
+            scene.vertices_in_world(), scene.picture, scene.look.camera, pick, drop
         )
+        return PlannedAction(gesture, {"pick_px": pick_px, "drop_xy_m": DROP_POINTS_M[drop]})
 
     def _judge(self) -> tuple[float, dict[str, Any]]:
         seen = found_markers(self._scene.picture, TSHIRT_MARKERS)
@@ -99,4 +114,18 @@ class TshirtFoldEnv(ClothTaskEnv):
         }
 
     def _target(self) -> FoldTarget:
-        return scripted_target(self._scene.garment, TARGET_LINES)
+        return scripted_target(self._scene.garment, tuple(PickAndDrop(*step) for step in SCRIPT))
+
+
+def _pick_and_drop(
+    vertices_in_world: NDArray[np.float64],
+    picture: NDArray[np.uint8],
+    camera: Camera,
+    pick: int,
+    drop: int,
+) -> tuple[Gesture, tuple[int, int]]:
+    """The gesture, and the pixel (column, row) of its pick point."""
+    column, row = extreme_pick_points(picture)[pick].tolist()
+    pick_xy_m = camera.table_point_m((column + 0.5, row + 0.5))
+    grasped = grasped_vertices(vertices_in_world, pick_xy_m)
+    return pick_and_drop(vertices_in_world, grasped, DROP_POINTS_M[drop]), (column, row)

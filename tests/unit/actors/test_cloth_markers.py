@@ -13,8 +13,8 @@ TSHIRT = make_garment("tshirt")
 
 
 def _picture(vertices: np.ndarray) -> np.ndarray:
-    paint = painted(TSHIRT, COLOURS.front, TSHIRT_MARKERS)
-    return draw_cloth(vertices, TSHIRT.mesh.faces, CAMERA, COLOURS, front_paint=paint)
+    paint = painted(TSHIRT, COLOURS, TSHIRT_MARKERS)
+    return draw_cloth(vertices, TSHIRT.mesh.faces, CAMERA, COLOURS, paint=paint)
 
 
 @pytest.mark.parametrize("shift_m", [(0.0, 0.0), (0.05, -0.04), (-0.06, 0.03)])
@@ -36,6 +36,11 @@ def test_a_marker_that_lies_face_down_is_not_seen() -> None:
     assert set(found) == {"sleeve_left", "hem_left", "hem_right"}
 
 
+def test_the_hems_markers_are_seen_from_behind_too() -> None:
+    behind = TSHIRT.mesh.vertices_m * [-1.0, 1.0, 1.0]
+    assert set(found_markers(_picture(behind), TSHIRT_MARKERS)) == {"hem_left", "hem_right"}
+
+
 def test_the_spread_tshirts_hem_is_where_algorithm_3_has_it() -> None:
     found = found_markers(_picture(TSHIRT.mesh.vertices_m), TSHIRT_MARKERS)
     for name, place in INITIAL_HEMS.items():
@@ -44,7 +49,7 @@ def test_the_spread_tshirts_hem_is_where_algorithm_3_has_it() -> None:
 
 def test_a_garment_without_the_keypoints_is_refused() -> None:
     with pytest.raises(ValueError, match=r"garment trousers: expected keypoints .* sleeve_left"):
-        painted(make_garment("trousers"), (0, 0, 0), TSHIRT_MARKERS)
+        painted(make_garment("trousers"), COLOURS, TSHIRT_MARKERS)
 
 
 SPREAD = INITIAL_HEMS | {"sleeve_right": (0.8, 0.4), "sleeve_left": (0.2, 0.4)}

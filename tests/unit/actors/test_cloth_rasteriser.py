@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from actors.cloth.camera import Camera
 from actors.cloth.masks import cloth_mask, red_mask
 from actors.cloth.meshes import rectangular_sheet
-from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Light, draw_cloth
+from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Light, Paint, draw_cloth
 
 CAMERA = Camera()
 SHEET = rectangular_sheet(12, 0.3)
@@ -131,9 +131,9 @@ def test_an_oblique_turned_camera_finds_table_points_again() -> None:
 
 
 def test_paint_and_light_change_the_colours_alone() -> None:
-    paint = np.tile(np.array([10, 200, 90], np.uint8), (len(SHEET.faces), 1))
+    green = np.tile(np.array([10, 200, 90], np.uint8), (len(SHEET.faces), 1))
     usual = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA)
-    painted = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA, front_paint=paint)
+    painted = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA, paint=Paint(green, green))
     dark = draw_cloth(SHEET.vertices_m, SHEET.faces, CAMERA, light=Light(strength=0.5))
     cloth = cloth_mask(usual)
     assert (painted[~cloth] == usual[~cloth]).all()

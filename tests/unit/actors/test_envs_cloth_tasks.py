@@ -10,6 +10,8 @@ from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import DAYLIGHT
 from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import ENV_IDS, ClothTaskEnv, FoldLinesEnv, TshirtFoldEnv, make_env
+from actors.envs.difficulties import DIFFICULTIES
+from actors.envs.fold_lines import FoldAlong
 from actors.envs.fold_targets import scripted_target
 from actors.envs.initial_states import INITIAL_STATES
 from actors.envs.randomisation import RANDOMISATIONS, SIM2REAL, Randomisation, make_randomisation
@@ -88,10 +90,23 @@ def test_the_actions_and_the_reward_of_an_episode_in_range(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", ["ShirtFold", "TrousersFold", "HandkerchiefFold"])
 def test_the_scripted_folds_succeed_from_elsewhere_too(env_id: str) -> None:
-    env = make(env_id, start_shift_m=0.01, start_turn_rad=0.1)
+    env = make(env_id)
     infos = [play(env, seed) for seed in range(3)]
     assert all(info["success"] for info in infos), infos
     assert play(make(env_id, initial_state="rotated"), 1)["particle_distance_m"] < 0.04
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in CLOTH_IDS if "Flip" not in env_id])
+def test_difficulties_differ_and_options_overrule_them(env_id: str) -> None:
+    def options(**given: Any) -> Any:
+        return make(env_id, **given).options
+
+    easy, medium, hard = (options(difficulty=name) for name in DIFFICULTIES)
+    assert medium == options()
+    assert len({repr(easy), repr(medium), repr(hard)}) == 3
+    assert options(difficulty="hard", start_turn_rad=0.0).start_turn_rad == 0.0
+    with pytest.raises(ValueError, match="difficulty: expected one of easy, medium, hard"):
+        make(env_id, difficulty="extreme")
 
 
 def test_wrong_folds_fail() -> None:
@@ -105,7 +120,7 @@ def test_wrong_folds_fail() -> None:
 
 
 def test_the_scripted_tshirt_is_folded_and_its_reward_grows() -> None:
-    env = make("TShirtFold", start_shift_m=0.005, start_turn_rad=0.03)
+    env = make("TShirtFold")
     assert isinstance(env, TshirtFoldEnv)
     info = play(env, 0)
     assert info["sleeves_folded"]
@@ -116,8 +131,8 @@ def test_a_target_is_much_smaller_than_the_garment_and_made_once() -> None:
     env = make("ShirtFold")
     assert isinstance(env, FoldLinesEnv)
     env.reset(seed=0)
-    target = scripted_target(env.garment, (0, 2, 4))
-    assert target is scripted_target(env.garment, [0, 2, 4])
+    target = scripted_target(env.garment, tuple(map(FoldAlong, (0, 2, 4))))
+    assert target is scripted_target(env.garment, tuple(map(FoldAlong, (0, 2, 4))))
     assert target.mask(env.camera).sum() < 0.5 * env.flat_px
 
 

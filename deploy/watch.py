@@ -1,0 +1,164 @@
+"""`clothbus watch`: an episode as a moving picture, with what each action did drawn into it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from actors.acting import Greedy, UniformlyRandom
+from actors.demonstrate.acting import scripted_demonstrator
+from actors.envs import ClothbusEnv, ClothTaskEnv, make_env
+from actors.policy import Policy
+from actors.rollout import ActingPolicy
+from broker_config.errors import PresetError, StorageError
+from deploy.run_folder import RunFolder
+from learner.snapshots import SnapshotStore
+
+FRAME_SECS: Final = 0.6
+SIZE_PX: Final = 336
+SUFFIXES: Final = (".gif", ".mp4")
+
+Picture = NDArray[np.uint8]
+_PICK, _DROP, _LINE = (255, 255, 255), (20, 20, 20), (40, 60, 220)
+
+
+@dataclass(frozen=True)
+class WatchedEpisode:
+    """An episode's pictures and outcome."""
+
+    frames: list[Picture]
+    """u8[size, size, 3], twice for each action: what is to be done, what came of it."""
+
+    return_: float
+    success: bool
+
+
+def watch(
+    env_id: str, who: str, options: Mapping[str, Any], seed: int, output: Path
+) -> WatchedEpisode:
+    """Plays an episode and writes it.
+
+    Args:
+        env_id: of `actors.envs.ENV_IDS`.
+        who: "scripted", "random", or a run folder, whose newest policy plays greedily.
+        options: keywords of the environment.
+        seed: of the environment, and of chance.
+        output: a file that ends in .gif or .mp4; it is replaced.
+
+    Raises:
+        PresetError: another ending, or a policy that does not fit the task.
+        StorageError: the folder holds no policy, or the file cannot be written.
+        ValueError: the task or an option does not exist.
+    """
+    if output.suffix not in SUFFIXES:
+        raise PresetError(
+            f"output: expected a file that ends in {' or '.join(SUFFIXES)}; got {output}; "
+            "choose one of them"
+        )
+    env = make_env(env_id, **{"render_mode": "rgb_array", "render_px": SIZE_PX, **options})
+    try:
+        episode = _played(env, _policy(who, env), seed)
+    finally:
+        env.close()
+    _write(episode.frames, output)
+    return episode
+
+
+def _policy(who: str, env: ClothbusEnv) -> ActingPolicy:
+    n_actions = int(env.action_space.n)  # type: ignore[attr-defined]  # all tasks are discrete
+    if who == "random":
+        return UniformlyRandom(n_actions)
+    if who == "scripted":
+        return scripted_demonstrator(env, n_actions, mistake_rate=0.0)
+    return Greedy(_learned(RunFolder(Path(who)), env, n_actions))
+
+
+def _learned(folder: RunFolder, env: ClothbusEnv, n_actions: int) -> Policy:
+    preset = folder.read_preset()
+    expected = (tuple(preset.task.observation_shape), preset.task.n_actions)
+    got = (tuple(env.observation_space.shape or ()), n_actions)
+    if expected != got:
+        raise PresetError(
+            f"{folder.path}: expected a task with observations {list(expected[0])} and "
+            f"{expected[1]} actions, as its policy has; got {list(got[0])} and {got[1]}; watch it "
+            f"at {preset.task.environment}"
+        )
+    store = SnapshotStore(folder.snapshots)
+    if not (versions := store.versions()):
+        raise StorageError(f"{folder.path}: expected a policy; got none; let the run begin first")
+    weights = store.get(versions[-1])
+    assert weights is not None
+    return Policy.from_bytes(preset.network, weights)
+
+
+def _played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:
+    random = np.random.default_rng([seed, 2])
+    picture, _ = env.reset(seed=seed)
+    frames, return_, is_over = [_rendered(env)], 0.0, False
+    while not is_over:
+        picture, reward, terminated, truncated, info = env.step(policy.act(picture, random, 0.0))
+        return_ += float(reward)
+        is_over = terminated or truncated
+        frames.append(_annotated(env, frames[-1], info))
+        frames.append(frames[-2] if info["guard"] else _rendered(env))
+    return WatchedEpisode(frames, return_, bool(info["success"]))
+
+
+def _rendered(env: ClothbusEnv) -> Picture:
+    frame = env.render()
+    assert isinstance(frame, np.ndarray), "it was made with a render mode"
+    return np.asarray(frame, dtype=np.uint8)
+
+
+def _annotated(env: ClothbusEnv, frame: Picture, info: Mapping[str, Any]) -> Picture:
+    """The picture before an action with the action drawn into it; reaching has nothing to draw."""
+    drawn = frame.copy()
+    task = env.unwrapped
+    if not isinstance(task, ClothTaskEnv):
+        return drawn
+    scale = len(frame) / task.options.observation_px
+
+    def pixel(xy_m: tuple[float, float]) -> tuple[int, int]:
+        x, y = task.camera.project_px(np.array([*xy_m, 0.0])) * scale
+        return round(float(x)), round(float(y))
+
+    if "fold_line_m" in info:
+        start, end = map(pixel, info["fold_line_m"])
+        cv2.line(drawn, start, end, _LINE, 2, cv2.LINE_AA)
+    if "pick_px" in info:
+        column, row = ((coordinate + 0.5) * scale for coordinate in info["pick_px"])
+        moves = [((round(column), round(row)), pixel(info["drop_xy_m"]))]
+    else:
+        moves = list(zip(map(pixel, info["grasps_m"]), map(pixel, info["drops_m"]), strict=True))
+    for pick, drop in moves:
+        cv2.arrowedLine(drawn, pick, drop, _PICK, 2, cv2.LINE_AA, tipLength=0.12)
+        cv2.circle(drawn, pick, 5, _PICK, -1, cv2.LINE_AA)
+        cv2.circle(drawn, drop, 3, _DROP, -1, cv2.LINE_AA)
+    return drawn
+
+
+def _write(frames: list[Picture], output: Path) -> None:
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if output.suffix == ".gif":
+        first, *rest = [Image.fromarray(frame) for frame in frames]
+        duration_ms = round(1e3 * FRAME_SECS)
+        first.save(output, save_all=True, append_images=rest, duration=duration_ms, loop=0)
+        return
+    height, width = frames[0].shape[:2]
+    codec = cv2.VideoWriter.fourcc(*"mp4v")
+    writer = cv2.VideoWriter(str(output), codec, 1 / FRAME_SECS, (width, height))
+    if not writer.isOpened():
+        raise StorageError(
+            f"{output}: expected a file that can be written; got none; check the folder, or write "
+            "a .gif"
+        )
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
