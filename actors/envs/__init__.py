@@ -22,7 +22,8 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions
+from actors.envs.cloth_options import ClothTaskOptions
+from actors.envs.cloth_task import ClothTaskEnv
 from actors.envs.difficulties import FOLDING, TSHIRT, Difficulty, check_difficulty
 from actors.envs.fold_lines import FoldLinesEnv
 from actors.envs.handkerchief import HandkerchiefFlipEnv

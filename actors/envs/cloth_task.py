@@ -24,7 +24,8 @@ from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Paint
-from actors.envs.arguments import check_range, check_render_mode, check_size, checked_action
+from actors.envs.arguments import checked_action
+from actors.envs.cloth_options import ClothTaskOptions
 from actors.envs.episode_clock import EpisodeClock
 from actors.envs.initial_states import (
     CREASES,
@@ -36,75 +37,12 @@ from actors.envs.initial_states import (
     fold_over,
     initial_pose,
 )
-from actors.envs.randomisation import Conditions, Randomisation, make_randomisation
+from actors.envs.randomisation import Conditions, make_randomisation
 from actors.envs.scene import Look, Scene
+from actors.robot.planning import Obstacle, UnreachableError
+from actors.robot.reach import Reach
 
 MOST_START_ATTEMPTS: Final = 5
-
-
-@dataclass(frozen=True)
-class ClothTaskOptions:
-    """What may be chosen for any cloth task, by keyword in `make_env` and in a preset."""
-
-    horizon: int = 30
-    """Steps in an episode."""
-
-    engine: str = "xpbd"
-    """A name of `actors.cloth.engines`."""
-
-    engine_settings: Settings | None = None
-    """The engine's own numbers where they differ from its defaults."""
-
-    sizes: Mapping[str, float] | None = None
-    """The garment's lengths where they differ from its defaults; see `actors.cloth.outlines`."""
-
-    spacing_m: float | None = None
-    """How far apart the garment's vertices are; by default the engine's usual."""
-
-    obj_path: str | None = None
-    """A garment of your own instead of the task's; see `actors.cloth.obj_files`."""
-
-    metres_per_unit: float = 1.0
-    """Of that file."""
-
-    view_half_width_m: float = 0.26
-    """Half the width of the table that the picture shows."""
-
-    initial_state: InitialState = "flat"
-    """See `actors.envs.initial_states`; `reset(options={"initial_state": ...})` overrules it."""
-
-    start_shift_m: float = 0.0
-    """The garment begins at most this far from its place, along x and along y."""
-
-    start_turn_rad: float = 0.0
-    """The garment begins turned by at most this, either way."""
-
-    randomisation: str | Randomisation | Mapping[str, float] = "off"
-    """A name, or ranges; see `actors.envs.randomisation`."""
-
-    observation_px: int = 84
-    """Width and height of the observation."""
-
-    render_px: int = 336
-    """Width and height of what `render` returns."""
-
-    render_mode: str | None = None
-    """None or "rgb_array"."""
-
-    def __post_init__(self) -> None:
-        """Check each value.
-
-        Raises:
-            ValueError: one is out of its rule.
-        """
-        check_size("observation_px", self.observation_px, least=16)
-        check_size("render_px", self.render_px, least=self.observation_px)
-        check_range("view_half_width_m", self.view_half_width_m, 0.05, 0.6)
-        check_range("start_shift_m", self.start_shift_m, 0.0, 0.1)
-        check_range("start_turn_rad", self.start_turn_rad, 0.0, np.pi)
-        check_initial_state(self.initial_state)
-        check_render_mode(self.render_mode)
-        make_randomisation(self.randomisation)
 
 
 @dataclass(frozen=True)
@@ -124,7 +62,9 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     reason. Such a transition must not be learned from. An episode is truncated at the horizon.
 
     `info` holds `success`, `guard` (None or a reason), the task's measures and, after a step, what
-    the action was.
+    the action was. With `robot` it also holds `action_mask` (i8[n_actions], 1 where the arms can do
+    it, as `action_space.sample` wants it) and, after a step, `unreachable` (None or an
+    `actors.robot.planning.Obstacle`): then the cloth was left as it is.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
@@ -165,6 +105,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._usual_garment = self._make_garment()
         self._conditions = Conditions()
         self._flat_px = 0
+        self._reach: Reach | None = None
         shape = (options.observation_px, options.observation_px, 3)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Discrete(n_actions)
@@ -249,7 +190,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             if reason is None:
                 self._clock.start()
                 _, measures = self._judge()
-                return self._scene.picture.copy(), measures | {"guard": None}
+                return self._scene.picture.copy(), measures | {"guard": None} | self._mask()
         raise ClothEngineError(
             f"reset(): expected a sound cloth within {MOST_START_ATTEMPTS} attempts; got "
             f"{reason}; give the engine a shorter time step or the cloth fewer vertices"
@@ -267,7 +208,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock.check_running()
         index = checked_action(action, self.n_actions)
         planned = self._plan(index)
-        reason = self._perform(planned.gesture)
+        unreachable = self._obstacle(planned.gesture)
+        reason = self._perform(planned.gesture) if unreachable is None else None
         truncated = self._clock.tick()
         reward, measures = self._judge()
         if reason is not None:
@@ -275,6 +217,9 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             truncated, reward = True, 0.0
             measures |= {"success": False}
         info = measures | planned.info | {"guard": None if reason is None else reason.value}
+        if self.options.robot:
+            info |= {"unreachable": None if unreachable is None else unreachable.value}
+            info |= self._mask() if reason is None else {}
         return self._scene.picture.copy(), reward, False, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -291,6 +236,33 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         """End the simulator; may be called twice."""
         self._clock.stop()
         self._scene.close()
+        if self._reach is not None:
+            self._reach.close()
+            self._reach = None
+
+    def _arms(self) -> Reach:
+        if self._reach is None:
+            self._reach = Reach()
+        return self._reach
+
+    def _obstacle(self, gesture: Gesture) -> Obstacle | None:
+        """Why the robot cannot make a gesture; None where it can, or there is no robot."""
+        if not self.options.robot:
+            return None
+        try:
+            self._arms().plan(self._scene.vertices_in_world(), gesture)
+        except UnreachableError as error:
+            return error.obstacle
+        return None
+
+    def _mask(self) -> dict[str, Any]:
+        """Which actions the robot can make, for `info`."""
+        if not self.options.robot:
+            return {}
+        vertices = self._scene.vertices_in_world()
+        gestures = [self._plan(action).gesture for action in range(self.n_actions)]
+        reachable = [self._arms().obstacle(vertices, gesture) is None for gesture in gestures]
+        return {"action_mask": np.array(reachable, dtype=np.int8)}
 
     def _try_start(self, name: InitialState) -> GuardReason | None:
         random = self.np_random

@@ -7,7 +7,8 @@ from actors.cloth.grasps import grasped_vertices
 from actors.cloth.masks import red_mask
 from actors.cloth.pick_points import PickPoints, contour_pick_points, grid_pick_points
 from actors.envs.arguments import check_range
-from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions, PlannedAction
+from actors.envs.cloth_options import ClothTaskOptions
+from actors.envs.cloth_task import ClothTaskEnv, PlannedAction
 
 DROP_POINTS_M: Final = tuple((x_m, y_m) for y_m in (0.09, -0.09) for x_m in (-0.12, 0.0, 0.12))
 """2 x 3 points of the table, from the picture's top left, row by row. **assumed**"""

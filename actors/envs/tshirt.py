@@ -13,7 +13,8 @@ from actors.cloth.grasps import grasped_vertices
 from actors.cloth.markers import TSHIRT_MARKERS, found_markers, painted
 from actors.cloth.pick_points import extreme_pick_points
 from actors.cloth.rasteriser import ClothColours, Paint, draw_cloth
-from actors.envs.cloth_task import ClothTaskEnv, ClothTaskOptions, PlannedAction
+from actors.envs.cloth_options import ClothTaskOptions
+from actors.envs.cloth_task import ClothTaskEnv, PlannedAction
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
 from actors.envs.tshirt_reward import RewardForm, TshirtReward
 

@@ -179,3 +179,23 @@ def test_size_noise_and_luck_change_what_they_name() -> None:
         stayed += np.array_equal(picture, before)
         before = picture
     assert 1 <= stayed <= 9
+
+
+def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
+    env = make("HandkerchiefFlip36", robot=True)
+    picture, info = env.reset(seed=0)
+    assert info["action_mask"].all()
+    moved, _, _, _, info = env.step(2 * 6 + 3)
+    assert info["unreachable"] is None
+    assert (moved != picture).any()
+    env.close()
+    far = make("HandkerchiefFold", robot=True)
+    picture, info = far.reset(seed=0)
+    mask = info["action_mask"]
+    assert mask.shape == (3,)
+    assert 0 < mask.sum() < 3
+    assert far.action_space.sample(mask) in np.flatnonzero(mask)
+    after, _, _, _, info = far.step(int(mask.argmin()))
+    assert info["unreachable"] in {"out_of_reach", "joint_limit", "self_collision"}
+    np.testing.assert_array_equal(after, picture)
+    far.close()
