@@ -25,7 +25,7 @@ def task(
     jobs: int = 1,
     options: Options = (),
 ) -> None:
-    """Test a task: its scripted expert must succeed at the end, random play must not.
+    """Test a task: its scripted expert must succeed at the end, random play must not flip a cloth.
 
     Args:
         env_id: A task's id, such as ShirtFold or clothbus/ShirtFold-v0.
