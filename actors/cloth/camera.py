@@ -6,8 +6,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_OBLIQUE_M = 1.0
-
 
 @dataclass(frozen=True)
 class Camera:
@@ -58,7 +56,7 @@ class Camera:
                     f"Camera.{field.name}: expected a positive number; got {value}; "
                     f"the default is {field.default}"
                 )
-            if not is_size and not abs(value) <= max(MOST_OBLIQUE_M, np.pi):
+            if not is_size and not abs(value) <= np.pi:
                 raise ValueError(
                     f"Camera.{field.name}: expected a number from {-np.pi:.2f} to {np.pi:.2f}; got "
                     f"{value}; the default is {field.default}"

@@ -113,22 +113,27 @@ def _aligned(points: NDArray[np.float64], target: NDArray[np.float64]) -> NDArra
 
 def _best_turn(mask: NDArray[np.bool_], target: NDArray[np.bool_]) -> float:
     step_deg = 360 / TURN_STEPS
+    centroids = _centroid(mask), _centroid(target)
     coarse = {turn * step_deg: 0.0 for turn in range(TURN_STEPS)}
     for turn_deg in coarse:
-        coarse[turn_deg] = iou(_moved(mask, target, turn_deg), target)
+        coarse[turn_deg] = iou(_moved(mask, centroids, turn_deg, target.shape), target)
     best_deg = max(coarse, key=lambda turn_deg: coarse[turn_deg])
     fine = [best_deg + quarter * step_deg / 4 for quarter in (-3, -2, -1, 1, 2, 3)]
-    return max(coarse[best_deg], *(iou(_moved(mask, target, turn), target) for turn in fine))
+    finest = (iou(_moved(mask, centroids, turn, target.shape), target) for turn in fine)
+    return max(coarse[best_deg], *finest)
 
 
 def _moved(
-    mask: NDArray[np.bool_], target: NDArray[np.bool_], turn_deg: float
+    mask: NDArray[np.bool_],
+    centroids: tuple[tuple[float, float], tuple[float, float]],
+    turn_deg: float,
+    shape: tuple[int, ...],
 ) -> NDArray[np.bool_]:
-    """The mask turned about its centroid and moved to that of the target."""
-    (x, y), (target_x, target_y) = _centroid(mask), _centroid(target)
+    """The mask turned about its centroid, which is moved onto the other one."""
+    (x, y), (target_x, target_y) = centroids
     matrix = cv2.getRotationMatrix2D((x, y), turn_deg, 1.0)
     matrix[:, 2] += np.array([target_x - x, target_y - y])
-    size = (target.shape[1], target.shape[0])
+    size = (shape[1], shape[0])
     moved = cv2.warpAffine(mask.astype(np.uint8) * 255, matrix, size, flags=cv2.INTER_LINEAR)
     return np.asarray(moved >= 128)
 

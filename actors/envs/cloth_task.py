@@ -39,7 +39,7 @@ from actors.envs.initial_states import (
 )
 from actors.envs.randomisation import Conditions, make_randomisation
 from actors.envs.scene import Look, Scene
-from actors.robot.planning import Obstacle, UnreachableError
+from actors.robot.planning import STEP_M, Obstacle
 from actors.robot.reach import Reach
 
 MOST_START_ATTEMPTS: Final = 5
@@ -163,8 +163,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     def vertices_in_world(self) -> NDArray[np.float64]:
         """Where the garment's vertices are, f64[V, 3], metres: for measures, never for learning.
 
-        Raises:
-            ClothEngineError: before the first reset, or after a step that lost the simulator.
+        After a step that the guard stopped, where they were before it.
         """
         return self._scene.vertices_in_world()
 
@@ -249,11 +248,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         """Why the robot cannot make a gesture; None where it can, or there is no robot."""
         if not self.options.robot:
             return None
-        try:
-            self._arms().plan(self._scene.vertices_in_world(), gesture)
-        except UnreachableError as error:
-            return error.obstacle
-        return None
+        return self._arms().obstacle(self._scene.vertices_in_world(), gesture, STEP_M)
 
     def _mask(self) -> dict[str, Any]:
         """Which actions the robot can make, for `info`."""
@@ -261,7 +256,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             return {}
         vertices = self._scene.vertices_in_world()
         gestures = [self._plan(action).gesture for action in range(self.n_actions)]
-        reachable = [self._arms().obstacle(vertices, gesture) is None for gesture in gestures]
+        reachable = [self._arms().obstacle(vertices, it, np.inf) is None for it in gestures]
         return {"action_mask": np.array(reachable, dtype=np.int8)}
 
     def _try_start(self, name: InitialState) -> GuardReason | None:

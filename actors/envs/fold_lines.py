@@ -107,11 +107,8 @@ class FoldLinesEnv(ClothTaskEnv):
         )
 
     def _judge(self) -> tuple[float, dict[str, Any]]:
-        iou = self._target().iou(self._scene.mask, self._scene.look.camera)
-        distance_m = self._target().distance_m(self._scene.vertices_in_world())
-        thresholds = self.task.thresholds
-        folded = iou >= thresholds.least_iou and distance_m <= thresholds.most_distance_m
-        return iou, {"success": folded, "iou": iou, "particle_distance_m": distance_m}
+        measures = self._target().measures(self._scene, self.task.thresholds)
+        return measures["iou"], measures
 
     def _target(self) -> FoldTarget:
         script = tuple(FoldAlong(self.task.lines[action]) for action in self.task.script)

@@ -17,9 +17,18 @@ from actors.cloth.measures import aligned_iou, mean_particle_distance_m
 from actors.cloth.rasteriser import draw_cloth
 from actors.cloth.xpbd_engine import XpbdEngine
 from actors.cloth.xpbd_settings import XpbdSettings
+from actors.envs.scene import Scene
 
 FOLDING_XPBD: Final[dict[str, Any]] = {"table_friction": 1.0, "bending_compliance": 1e-4}
 """With less friction cloth slides under the fold; stiffer, small folds spring open."""
+
+
+@dataclass(frozen=True)
+class FoldThresholds:
+    """How like its target a garment must be to count as folded."""
+
+    least_iou: float
+    most_distance_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,13 +52,12 @@ class FoldTarget:
         mirrored = any(symmetry.mirrored for symmetry in self.garment.symmetries)
         return aligned_iou(mask, self.mask(camera), may_mirror=mirrored)
 
-
-@dataclass(frozen=True)
-class FoldThresholds:
-    """How like its target a garment must be to count as folded."""
-
-    least_iou: float
-    most_distance_m: float
+    def measures(self, scene: Scene, thresholds: FoldThresholds) -> dict[str, Any]:
+        """`success`, `iou` and `particle_distance_m` of the scene's garment, for `info`."""
+        iou = self.iou(scene.mask, scene.look.camera)
+        distance_m = self.distance_m(scene.vertices_in_world())
+        folded = iou >= thresholds.least_iou and distance_m <= thresholds.most_distance_m
+        return {"success": folded, "iou": iou, "particle_distance_m": distance_m}
 
 
 class FoldStep(Protocol):

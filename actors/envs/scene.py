@@ -69,6 +69,7 @@ class Scene:
         self._garment: Garment | None = None
         self._look: Look | None = None
         self._picture = np.zeros((0, 0, 3), np.uint8)
+        self._vertices = np.zeros((0, 3))
         self._random: np.random.Generator | None = None
 
     @property
@@ -99,8 +100,8 @@ class Scene:
         return cloth_mask(self._picture)
 
     def vertices_in_world(self) -> NDArray[np.float64]:
-        """Where the vertices are, f64[V, 3], metres."""
-        return self._engine.vertices_in_world()
+        """Where the vertices last were in order, f64[V, 3], metres: as in the picture."""
+        return self._vertices.copy()
 
     def lay(
         self,
@@ -156,5 +157,5 @@ class Scene:
         picture = self.look.picture(vertices, self.garment, self._random)
         if cloth_mask(picture).sum() < NO_CLOTH_PX:
             return GuardReason.OUT_OF_VIEW
-        self._picture = picture
+        self._picture, self._vertices = picture, vertices
         return None

@@ -102,14 +102,8 @@ class TshirtFoldEnv(ClothTaskEnv):
 
     def _judge(self) -> tuple[float, dict[str, Any]]:
         seen = found_markers(self._scene.picture, TSHIRT_MARKERS)
-        iou = self._target().iou(self._scene.mask, self._scene.look.camera)
-        distance_m = self._target().distance_m(self._scene.vertices_in_world())
-        folded = iou >= THRESHOLDS.least_iou and distance_m <= THRESHOLDS.most_distance_m
         reward = self._reward(seen)
-        return reward, {
-            "success": folded,
-            "iou": iou,
-            "particle_distance_m": distance_m,
+        return reward, self._target().measures(self._scene, THRESHOLDS) | {
             "sleeves_folded": self._reward.sleeves_folded(seen),
             "markers": seen,
         }

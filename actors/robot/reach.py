@@ -7,7 +7,7 @@ from actors.cloth.engine import TABLE_HALF_WIDTH_M
 from actors.cloth.gestures import Gesture
 from actors.cloth.quiet_pybullet import pybullet
 from actors.robot.body import RobotBody
-from actors.robot.planning import ArmPlanner, MotionPlan, Obstacle, UnreachableError
+from actors.robot.planning import STEP_M, ArmPlanner, MotionPlan, Obstacle, UnreachableError
 
 TABLE_BEGINS_M = -0.22
 """The table's edge is before the robot: it does not stand in it."""
@@ -32,19 +32,23 @@ class Reach:
         self.body = RobotBody(self._client)
         self._planner = ArmPlanner(self.body, table)
 
-    def plan(self, vertices_in_world: NDArray[np.float64], gesture: Gesture) -> MotionPlan:
-        """The joints' way for a gesture on cloth that lies so, f64[V, 3].
+    def plan(
+        self, vertices_in_world: NDArray[np.float64], gesture: Gesture, step_m: float = STEP_M
+    ) -> MotionPlan:
+        """The joints' way for a gesture on cloth that lies so, f64[V, 3]; see `ArmPlanner.plan`.
 
         Raises:
             UnreachableError: the robot cannot make it.
         """
-        return self._planner.plan(_starts(vertices_in_world, gesture), gesture)
+        starts = np.stack([vertices_in_world[hand.grasped[0]] for hand in gesture.hands])
+        return self._planner.plan(starts, gesture, step_m)
 
-    def obstacle(self, vertices_in_world: NDArray[np.float64], gesture: Gesture) -> Obstacle | None:
-        """Why the robot cannot make a gesture; None where it can, as far as its stations say."""
+    def obstacle(
+        self, vertices_in_world: NDArray[np.float64], gesture: Gesture, step_m: float = STEP_M
+    ) -> Obstacle | None:
+        """Why there is no such plan; None where there is one."""
         try:
-            starts = _starts(vertices_in_world, gesture)
-            self._planner.plan(starts, gesture, step_m=np.inf)
+            self.plan(vertices_in_world, gesture, step_m)
         except UnreachableError as error:
             return error.obstacle
         return None
@@ -54,7 +58,3 @@ class Reach:
         if self._client is not None:
             pybullet.disconnect(physicsClientId=self._client)
         self._client = None
-
-
-def _starts(vertices_in_world: NDArray[np.float64], gesture: Gesture) -> NDArray[np.float64]:
-    return np.stack([vertices_in_world[hand.grasped[0]] for hand in gesture.hands])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from actors.cloth.engine import ClothEngineError
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import DAYLIGHT
 from actors.demonstrate.acting import scripted_demonstrator
@@ -199,3 +200,21 @@ def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
     assert info["unreachable"] in {"out_of_reach", "joint_limit", "self_collision"}
     np.testing.assert_array_equal(after, picture)
     far.close()
+
+
+@pytest.mark.parametrize("env_id", ["ShirtFold", "TShirtFold"])
+def test_a_lost_simulator_truncates_a_fold_with_the_measures_before_it(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make(env_id)
+    picture, before = env.reset(seed=0)
+
+    def lose(*_: object) -> None:
+        env._scene._engine.close()
+        raise ClothEngineError
+
+    monkeypatch.setattr(env._scene._engine, "perform", lose)
+    after, reward, _, truncated, info = env.step(0)
+    np.testing.assert_array_equal(after, picture)
+    assert (reward, truncated, info["guard"]) == (0.0, True, "engine_lost")
+    assert info["particle_distance_m"] == before["particle_distance_m"]
