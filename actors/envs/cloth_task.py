@@ -20,7 +20,8 @@ from actors.cloth.garments import (
     make_garment,
     usual_spacing_m,
 )
-from actors.cloth.gestures import Gesture
+from actors.cloth.gestures import Gesture, pick_and_drop
+from actors.cloth.grasps import grasped_vertices
 from actors.cloth.guard import GuardReason
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Paint
@@ -52,6 +53,22 @@ class PlannedAction:
     gesture: Gesture
     info: dict[str, Any] = field(default_factory=dict)
     """Where hands pick and drop, for `info`: pixels and metres."""
+
+
+def planned_pick_and_drop(
+    vertices_in_world: NDArray[np.float64],
+    camera: Camera,
+    pick_px: NDArray[np.int64],
+    drop_xy_m: tuple[float, float],
+) -> PlannedAction:
+    """Pick cloth that lies so, f64[V, 3], up at a pixel i64[2] (column, row) and drop it."""
+    column, row = pick_px.tolist()
+    pick_xy_m = camera.table_point_m((column + 0.5, row + 0.5))
+    grasped = grasped_vertices(vertices_in_world, pick_xy_m)
+    return PlannedAction(
+        pick_and_drop(vertices_in_world, grasped, drop_xy_m),
+        {"pick_px": (column, row), "drop_xy_m": drop_xy_m},
+    )
 
 
 class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):

@@ -2,13 +2,11 @@
 
 from typing import Any, Final, Literal
 
-from actors.cloth.gestures import pick_and_drop
-from actors.cloth.grasps import grasped_vertices
 from actors.cloth.masks import red_mask
 from actors.cloth.pick_points import PickPoints, contour_pick_points, grid_pick_points
 from actors.envs.arguments import check_range
 from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv, PlannedAction
+from actors.envs.cloth_task import ClothTaskEnv, PlannedAction, planned_pick_and_drop
 
 DROP_POINTS_M: Final = tuple((x_m, y_m) for y_m in (0.09, -0.09) for x_m in (-0.12, 0.0, 0.12))
 """2 x 3 points of the table, from the picture's top left, row by row. **assumed**"""
@@ -70,13 +68,10 @@ class HandkerchiefFlipEnv(ClothTaskEnv):
 
     def _plan(self, action: int) -> PlannedAction:
         pick, drop = divmod(action, len(DROP_POINTS_M))
-        column, row = self._pick_points(self._scene.picture)[pick].tolist()
-        pick_xy_m = self._scene.look.camera.table_point_m((column + 0.5, row + 0.5))
-        vertices = self._scene.vertices_in_world()
-        grasped = grasped_vertices(vertices, pick_xy_m)
-        return PlannedAction(
-            pick_and_drop(vertices, grasped, DROP_POINTS_M[drop]),
-            {"pick_px": (column, row), "drop_xy_m": DROP_POINTS_M[drop]},
+        scene = self._scene
+        pick_px = self._pick_points(scene.picture)[pick]
+        return planned_pick_and_drop(
+            scene.vertices_in_world(), scene.look.camera, pick_px, DROP_POINTS_M[drop]
         )
 
     def _judge(self) -> tuple[float, dict[str, Any]]:

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
 from actors.cloth.garments import Garment
-from actors.cloth.gestures import Gesture, pick_and_drop
-from actors.cloth.grasps import grasped_vertices
+from actors.cloth.gestures import Gesture
 from actors.cloth.markers import TSHIRT_MARKERS, found_markers, painted
 from actors.cloth.pick_points import extreme_pick_points
 from actors.cloth.rasteriser import ClothColours, Paint, draw_cloth
 from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv, PlannedAction
+from actors.envs.cloth_task import ClothTaskEnv, PlannedAction, planned_pick_and_drop
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
 from actors.envs.tshirt_reward import RewardForm, TshirtReward
 
@@ -49,7 +48,9 @@ class PickAndDrop:
     def gesture(self, vertices_in_world: NDArray[np.float64], garment: Garment) -> Gesture:
         """The step, planned on the task's usual picture."""
         picture = draw_cloth(vertices_in_world, garment.mesh.faces, _EYE, COLOURS)
-        return _pick_and_drop(vertices_in_world, picture, _EYE, self.pick, self.drop)[0]
+        pick_px = extreme_pick_points(picture)[self.pick]
+        drop_xy_m = DROP_POINTS_M[self.drop]
+        return planned_pick_and_drop(vertices_in_world, _EYE, pick_px, drop_xy_m).gesture
 
 
 _EYE: Final = Camera(view_half_width_m=VIEW_HALF_WIDTH_M)
@@ -95,10 +96,10 @@ class TshirtFoldEnv(ClothTaskEnv):
     def _plan(self, action: int) -> PlannedAction:
         pick, drop = divmod(action, len(DROP_POINTS_M))
         scene = self._scene
-        gesture, pick_px = _pick_and_drop(
-            scene.vertices_in_world(), scene.picture, scene.look.camera, pick, drop
+        pick_px = extreme_pick_points(scene.picture)[pick]
+        return planned_pick_and_drop(
+            scene.vertices_in_world(), scene.look.camera, pick_px, DROP_POINTS_M[drop]
         )
-        return PlannedAction(gesture, {"pick_px": pick_px, "drop_xy_m": DROP_POINTS_M[drop]})
 
     def _judge(self) -> tuple[float, dict[str, Any]]:
         seen = found_markers(self._scene.picture, TSHIRT_MARKERS)
@@ -110,17 +111,3 @@ class TshirtFoldEnv(ClothTaskEnv):
 
     def _target(self) -> FoldTarget:
         return scripted_target(self._scene.garment, tuple(PickAndDrop(*step) for step in SCRIPT))
-
-
-def _pick_and_drop(
-    vertices_in_world: NDArray[np.float64],
-    picture: NDArray[np.uint8],
-    camera: Camera,
-    pick: int,
-    drop: int,
-) -> tuple[Gesture, tuple[int, int]]:
-    """The gesture, and the pixel (column, row) of its pick point."""
-    column, row = extreme_pick_points(picture)[pick].tolist()
-    pick_xy_m = camera.table_point_m((column + 0.5, row + 0.5))
-    grasped = grasped_vertices(vertices_in_world, pick_xy_m)
-    return pick_and_drop(vertices_in_world, grasped, DROP_POINTS_M[drop]), (column, row)
