@@ -1,7 +1,6 @@
 """What keeps a cloth's vertices apart and together: distances that follow from its mesh."""
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ STRAIGHT = 0.98
 
 @dataclass(frozen=True, eq=False)
 class DistanceConstraints:
-    """Pairs of vertices that want to be at their distance at rest, and pairs that never collide."""
+    """Pairs of vertices that want to be at their distance at rest."""
 
     pairs: NDArray[np.int32]
     """i32[C, 2], in the order in which they are solved."""
@@ -27,10 +26,6 @@ class DistanceConstraints:
     """f64[C]."""
     compliances: NDArray[np.float64]
     """f64[C]."""
-    neighbours: NDArray[np.int32]
-    """i32[K], for each vertex in turn those that it does not collide with."""
-    first_neighbour: NDArray[np.int32]
-    """i32[V + 1], where in `neighbours` those of a vertex begin."""
 
 
 def distance_constraints(mesh: ClothMesh, settings: XpbdSettings) -> DistanceConstraints:
@@ -51,9 +46,7 @@ def distance_constraints(mesh: ClothMesh, settings: XpbdSettings) -> DistanceCon
     pairs, compliances = np.ascontiguousarray(pairs[order]), compliances[order]
     ends = mesh.vertices_m[pairs]
     lengths_m = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    close_m = settings.thickness_cells * mesh.spacing_m * 1.05
-    neighbours, first = _never_colliding(mesh, close_m)
-    return DistanceConstraints(pairs, lengths_m, compliances, neighbours, first)
+    return DistanceConstraints(pairs, lengths_m, compliances)
 
 
 def _opposite_vertices(
@@ -102,16 +95,3 @@ def _adjacent(mesh: ClothMesh) -> list[set[int]]:
         around[a].add(b)
         around[b].add(a)
     return around
-
-
-def _never_colliding(
-    mesh: ClothMesh, close_m: float
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Vertices that are joined by an edge, or closer at rest than layers may come."""
-    lists = []
-    for vertex, joined in enumerate(_adjacent(mesh)):
-        distances_m = np.linalg.norm(mesh.vertices_m - mesh.vertices_m[vertex], axis=1)
-        lists.append(sorted(joined | set(np.flatnonzero(distances_m < close_m).tolist())))
-    first = np.cumsum([0, *map(len, lists)])
-    assert all(a < b for a, b in pairwise(first))
-    return np.concatenate(lists).astype(np.int32), first.astype(np.int32)

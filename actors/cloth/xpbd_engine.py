@@ -10,13 +10,15 @@ from actors.cloth.gestures import Gesture, hand_paths_in_world, turns_in_world
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.xpbd_constraints import distance_constraints
 from actors.cloth.xpbd_settings import XpbdSettings
-from actors.cloth.xpbd_solver import Body, Distances, Numbers, advance
+from actors.cloth.xpbd_solver import Body, Distances, Numbers, advance, share_corrections
 
 FRAME_SECS = 1 / 60
 """How often it is looked whether the cloth has come to rest."""
 RESTING_FRAMES = 3
 """So many slow frames in a row are rest: cloth that turns back is slow for one."""
-SKIN_THICKNESSES = 0.75
+SKIN_THICKNESSES = 1.0
+NEIGHBOUR_SPACINGS = 1.5
+"""Vertices so close at rest, along a diagonal at most, never count as layers."""
 ROOM_FOR_PAIRS = 64
 """Close pairs for each vertex; a crumpled handkerchief has about ten."""
 
@@ -72,23 +74,27 @@ class XpbdEngine:
     def vertices_in_world(self) -> NDArray[np.float64]:
         """Where the vertices are, f64[V, 3]: a copy; see `ClothEngine.vertices_in_world`."""
         _ = self.mesh
-        return self._body.positions_m.copy()
+        return np.ascontiguousarray(self._body.positions_m.T)
 
     def perform(self, gesture: Gesture) -> None:
         """Let hands move the cloth; see `ClothEngine.perform`."""
         gesture.check(len(self.mesh.vertices_m))
         grasped = np.concatenate([hand.grasped for hand in gesture.hands])
         path_m = self._grasped_path_m(gesture)
-        self._body.inverse_masses[grasped] = 0.0
+        self._hold(grasped)
         self._advance(len(path_m), grasped, path_m)
-        self._body.inverse_masses[grasped] = 1.0
-        self._body.velocities_m_per_s[grasped] = 0.0  # fingers stop before they open
+        self._hold(_NOTHING)
+        self._body.velocities_m_per_s[:, grasped] = 0.0  # fingers stop before they open
         self._settle(gesture.motion.settle_secs)
 
     def save(self) -> XpbdState:
         """The whole state, independent of what the engine does next."""
         mesh, body = self.mesh, self._body
-        return XpbdState(mesh, body.positions_m.copy(), body.velocities_m_per_s.copy())
+        return XpbdState(
+            mesh,
+            np.ascontiguousarray(body.positions_m.T),
+            np.ascontiguousarray(body.velocities_m_per_s.T),
+        )
 
     def restore(self, state: XpbdState) -> None:
         """Return to a state that `save` gave, also to that of another cloth."""
@@ -107,12 +113,13 @@ class XpbdEngine:
         thickness_m = settings.thickness_cells * mesh.spacing_m
         skin_m = SKIN_THICKNESSES * thickness_m
         cell_m = thickness_m + skin_m
+        n_cells = int(2 * TABLE_HALF_WIDTH_M / cell_m) + 1
         self._distances = Distances(
-            constraints.pairs,
-            constraints.rest_lengths_m,
+            constraints.pairs.astype(np.uint32),
+            constraints.rest_lengths_m**2,
             constraints.compliances / substep_secs**2,
-            constraints.neighbours,
-            constraints.first_neighbour,
+            np.zeros((len(constraints.pairs), 2)),
+            np.ascontiguousarray(mesh.vertices_m.T),
         )
         self._numbers = Numbers(
             substep_secs,
@@ -121,25 +128,33 @@ class XpbdEngine:
             settings.layer_friction,
             settings.damping_per_sec,
             settings.fastest_m_per_s,
+            NEIGHBOUR_SPACINGS * mesh.spacing_m,
             -TABLE_HALF_WIDTH_M,
             cell_m,
+            n_cells,
             skin_m,
         )
-        self._body = _new_body(len(mesh.vertices_m), int(2 * TABLE_HALF_WIDTH_M / cell_m) + 1)
+        self._body = _new_body(len(mesh.vertices_m), n_cells)
         self._mesh = mesh
 
     def _place(
         self, positions_m: NDArray[np.float64], velocities_m_per_s: NDArray[np.float64]
     ) -> None:
         body = self._body
-        body.positions_m[:] = positions_m
-        body.velocities_m_per_s[:] = velocities_m_per_s
-        body.inverse_masses[:] = 1.0
+        body.positions_m[:] = positions_m.T
+        body.velocities_m_per_s[:] = velocities_m_per_s.T
         body.n_close_pairs[0] = -1
+        self._hold(_NOTHING)
+
+    def _hold(self, grasped: NDArray[np.int64]) -> None:
+        """These vertices, and no others, go where hands take them."""
+        self._body.inverse_masses[:] = 1.0
+        self._body.inverse_masses[grasped] = 0.0
+        share_corrections(self._body, self._distances)
 
     def _grasped_path_m(self, gesture: Gesture) -> NDArray[np.float64]:
         """Where each grasped vertex is after each substep, f64[K, k, 3]: rigid with its hand."""
-        positions_m = self._body.positions_m
+        positions_m = self.vertices_in_world()
         firsts = [hand.grasped[0] for hand in gesture.hands]
         paths = hand_paths_in_world(positions_m[firsts], gesture, self._numbers.substep_secs)
         held_m = []
@@ -149,7 +164,11 @@ class XpbdEngine:
                 turned_m = offsets_m[None]
             else:
                 turned_m = offsets_m @ turns_in_world(hand, paths[:, index, 3]).swapaxes(1, 2)
-            held_m.append(paths[:, index, None, :3] + turned_m)
+            way_m = paths[:, index, None, :3] + turned_m
+            # What is turned over must not be pushed into the table.
+            too_deep_m = self._numbers.thickness_m / 2 - way_m[:, :, 2].min(axis=1)
+            way_m[:, :, 2] += np.maximum(too_deep_m, 0.0)[:, None]
+            held_m.append(way_m)
         return np.concatenate(held_m, axis=1)
 
     def _settle(self, least_secs: float) -> None:
@@ -184,13 +203,14 @@ class XpbdEngine:
 
 def _new_body(n_vertices: int, n_cells: int) -> Body:
     return Body(
-        positions_m=np.zeros((n_vertices, 3)),
-        velocities_m_per_s=np.zeros((n_vertices, 3)),
+        positions_m=np.zeros((3, n_vertices)),
+        velocities_m_per_s=np.zeros((3, n_vertices)),
         inverse_masses=np.ones(n_vertices),
-        previous_m=np.zeros((n_vertices, 3)),
-        listed_at_m=np.zeros((n_vertices, 3)),
-        close_pairs=np.zeros((ROOM_FOR_PAIRS * n_vertices, 2), np.int32),
+        previous_m=np.zeros((3, n_vertices)),
+        listed_at_m=np.zeros((3, n_vertices)),
+        close_pairs=np.zeros((ROOM_FOR_PAIRS * n_vertices, 2), np.uint32),
         n_close_pairs=np.full(1, -1),
-        first_in_cell=np.zeros((n_cells, n_cells), np.int32),
-        next_in_cell=np.zeros(n_vertices, np.int32),
+        cells=np.zeros(n_vertices, np.uint32),
+        first_in_cell=np.zeros(n_cells * n_cells + 1, np.uint32),
+        by_cell=np.zeros(n_vertices, np.uint32),
     )
