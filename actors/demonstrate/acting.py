@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.demonstrate.folding import scripted_tshirt_action
-from actors.demonstrate.scripted import (
-    imperfect_action,
-    scripted_flip_action,
-    scripted_reach_action,
-)
+from actors.demonstrate.looking_ahead import FlipExpert
+from actors.demonstrate.scripted import imperfect_action, scripted_reach_action
 from actors.envs import (
     ClothbusEnv,
     FoldLinesEnv,
@@ -47,7 +44,7 @@ def scripted_demonstrator(
 
     Args:
         env: The one that it will act in. Scripts see its pictures; that of reaching also the arm's
-            angles, those of folding along lines which step it is.
+            angles, those of folding along lines which step it is, that of flipping the cloth.
         n_actions: Of the task.
         mistake_rate: Share of its actions that are random, 0 to 1.
 
@@ -62,9 +59,8 @@ def _script(env: ClothbusEnv) -> Script:
     if isinstance(task, ReachingEnv):
         return lambda _: scripted_reach_action(task.joint_angles_rad)
     if isinstance(task, HandkerchiefFlipEnv):
-        return lambda picture: scripted_flip_action(
-            picture, task.pick_rule, task.camera, task.flat_px
-        )
+        expert = FlipExpert(task)
+        return lambda _: expert.action()
     if isinstance(task, TshirtFoldEnv):
         return lambda picture: scripted_tshirt_action(picture, task.camera)
     if isinstance(task, FoldLinesEnv):

@@ -24,7 +24,13 @@ from numpy.typing import NDArray
 
 from actors.envs.cloth_options import ClothTaskOptions
 from actors.envs.cloth_task import ClothTaskEnv
-from actors.envs.difficulties import FOLDING, TSHIRT, Difficulty, check_difficulty
+from actors.envs.difficulties import (
+    FLIPPING,
+    FOLDING,
+    TSHIRT,
+    Difficulty,
+    check_difficulty,
+)
 from actors.envs.fold_lines import FoldLinesEnv
 from actors.envs.handkerchief import HandkerchiefFlipEnv
 from actors.envs.reaching import ReachingEnv
@@ -98,9 +104,11 @@ class _ClothTask(_Task):
 
 _TASKS: Final[Mapping[str, _Task]] = {
     "clothbus/Reaching-v0": _Task(ReachingEnv),
-    "clothbus/HandkerchiefFlip36-v0": _ClothTask(HandkerchiefFlipEnv, {"pick_rule": "grid"}),
+    "clothbus/HandkerchiefFlip36-v0": _ClothTask(
+        HandkerchiefFlipEnv, {"pick_rule": "grid"}, {}, FLIPPING
+    ),
     "clothbus/HandkerchiefFlip60-v0": _ClothTask(
-        HandkerchiefFlipEnv, {"pick_rule": "contour"}, {"initial_state": "random"}
+        HandkerchiefFlipEnv, {"pick_rule": "contour"}, {"initial_state": "random"}, FLIPPING
     ),
     "clothbus/TShirtFold-v0": _ClothTask(
         TshirtFoldEnv, {}, {"horizon": 8, "view_half_width_m": TSHIRT_VIEW_M}, TSHIRT

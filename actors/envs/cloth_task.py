@@ -184,6 +184,14 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         """
         return self._scene.vertices_in_world()
 
+    def planned(self, action: int) -> PlannedAction:
+        """What an action would mean for the cloth as the last picture shows it."""
+        return self._plan(checked_action(action, self.n_actions))
+
+    def picture_of(self, vertices_in_world: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """The observation without noise if the garment lay so, f64[V, 3], metres."""
+        return self._scene.look.picture(vertices_in_world, self._scene.garment)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:

@@ -1,8 +1,8 @@
-"""Named difficulties of the folding tasks: what a result must say to be compared with another.
+"""Named difficulties of the cloth tasks: what a result must say to be compared with another.
 
 Frozen on 2026-11-22, before any learner was run on them. `clothbus task ID --set difficulty=NAME`
 prints what the scripted expert and random play achieve; at the medium one, which is the default,
-the expert succeeds in at least 95 % of episodes.
+the expert succeeds in at least 95 % of episodes, and chance flips at most 10 % of handkerchiefs.
 """
 
 from collections.abc import Mapping
@@ -13,6 +13,13 @@ DIFFICULTIES: Final[tuple[Difficulty, ...]] = get_args(Difficulty)
 
 Options = Mapping[str, Any]
 """Of `ClothTaskOptions`."""
+
+FLIPPING: Final[Mapping[Difficulty, Options]] = {
+    "easy": {},
+    "medium": {"start_shift_m": 0.01, "start_turn_rad": 0.1},
+    "hard": {"start_shift_m": 0.03, "start_turn_rad": 0.5},
+}
+"""Of a handkerchief of 0.3 m: for a larger one chance flips more often, see docs/tasks.md."""
 
 FOLDING: Final[Mapping[Difficulty, Options]] = {
     "easy": {},

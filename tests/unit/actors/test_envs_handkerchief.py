@@ -10,7 +10,6 @@ from gymnasium.utils.env_checker import check_env
 from actors.cloth.engine import ClothEngineError
 from actors.cloth.masks import cloth_mask, red_mask
 from actors.cloth.pybullet_process import PyBulletProcessEngine
-from actors.demonstrate.scripted import scripted_flip_action
 from actors.envs import ClothTaskOptions, HandkerchiefFlipEnv, make_env
 from actors.envs.handkerchief import PickRule
 
@@ -74,19 +73,6 @@ def test_reward_is_the_red_portion_of_the_picture() -> None:
     assert info["drop_xy_m"] == (-0.12, -0.09)
     column, row = info["pick_px"]
     assert column > 42 > row
-
-
-@pytest.mark.parametrize("engine", ["pybullet", "xpbd"])
-def test_the_scripted_rule_flips_the_cloth(engine: str) -> None:
-    env = make(horizon=8, engine=engine)
-    picture, info = env.reset(seed=0)
-    truncated = False
-    while not (truncated or info["success"]):
-        action = scripted_flip_action(picture, "grid", env.camera, env.flat_px)
-        picture, _, _, truncated, info = env.step(action)
-    env.close()
-    assert info["success"]
-    assert info["red_over_flat"] >= 0.8
 
 
 def test_the_horizon_truncates_and_a_new_episode_is_needed(env: HandkerchiefFlipEnv) -> None:
