@@ -1,4 +1,4 @@
-"""Draws the tables of docs/delivery.md from the newest results of each benchmark.
+"""Draws the tables of docs/delivery.md and docs/cloth.md from the newest results.
 
 python -m tests.benchmarks.tables build/bench/results.jsonl
 """
@@ -14,7 +14,6 @@ from typing import Any
 
 from tests.benchmarks.measuring import RESULTS
 
-PAGE = Path("docs/delivery.md")
 Line = dict[str, Any]
 
 
@@ -127,29 +126,89 @@ def ingest_costs(lines: Sequence[Line]) -> str:
     return table(["step", "ms"], rows) + made_by(lines, f"{it['trajectories']} trajectories")
 
 
-DRAWN: dict[str, Callable[[Sequence[Line]], str]] = {
-    "losses": losses,
-    "delivery_load": delivery_load,
-    "light_actors": light_actors,
-    "recording_load": recording_load,
-    "ingest_costs": ingest_costs,
+def cloth_speed(lines: Sequence[Line]) -> str:
+    """Actions a second of each engine and garment, and their ratios."""
+    it = lines[-1]
+    medians = {name: sorted(rates)[len(rates) // 2] for name, rates in it["rates"].items()}
+    slowest = medians["handkerchief, pybullet as deformable-ravens has it"]
+    rows = [
+        [
+            name, it["vertices"][name], f"{median:.1f}",
+            f"{min(it['rates'][name]):.1f} to {max(it['rates'][name]):.1f}",
+            f"{median / slowest:.1f}", it["guarded"][name],
+        ]
+        for name, median in medians.items()
+    ]  # fmt: skip
+    head = [
+        "garment, engine", "vertices", "actions a second and core, median", "least to most",
+        "over deformable-ravens' cloth", "guarded",
+    ]  # fmt: skip
+    n_rounds = len(next(iter(it["rates"].values())))
+    return table(head, rows) + made_by(lines, f"{n_rounds} rounds of {it['actions']} actions")
+
+
+def cloth_blow_ups(lines: Sequence[Line]) -> str:
+    """Random actions and guarded steps of the newest line of each task and engine."""
+    newest = {(it["task"], it["engine"]): it for it in lines}
+    rows = [
+        [
+            task, engine, it["actions"], sum(it["guarded"].values()),
+            f"{100 * sum(it['guarded'].values()) / it['actions']:.3f} %",
+            ", ".join(f"{reason} {n}" for reason, n in it["guarded"].items()) or "none",
+        ]
+        for (task, engine), it in newest.items()
+    ]  # fmt: skip
+    head = ["task", "engine", "random actions", "guarded", "portion", "reasons"]
+    return table(head, rows) + made_by(lines, "Random play from the task's own start")
+
+
+def engine_comparison(lines: Sequence[Line]) -> str:
+    """How unlike the cloth lies after the same actions."""
+    it = lines[-1]
+    rows = [
+        [kind, other, number + 1, found["coverage"], found["iou"], found["distance_mm"]]
+        for kind, others in it["medians"].items()
+        for other, by_action in others.items()
+        for number, found in enumerate(by_action)
+    ]
+    head = ["garment", "XPBD against", "actions", "coverage, difference", "IoU", "distance, mm"]
+    return table(head, rows) + made_by(lines, f"Medians of {it['episodes']} episodes")
+
+
+PAGES: dict[Path, dict[str, Callable[[Sequence[Line]], str]]] = {
+    Path("docs/delivery.md"): {
+        "losses": losses,
+        "delivery_load": delivery_load,
+        "light_actors": light_actors,
+        "recording_load": recording_load,
+        "ingest_costs": ingest_costs,
+    },
+    Path("docs/cloth.md"): {
+        "cloth_speed": cloth_speed,
+        "cloth_blow_ups": cloth_blow_ups,
+        "engine_comparison": engine_comparison,
+    },
 }
 
 
 def main() -> None:
     results = Path(sys.argv[1]) if len(sys.argv) > 1 else RESULTS
     lines = [json.loads(text) for text in results.read_text().splitlines()]
-    page = PAGE.read_text()
-    for name, draw in DRAWN.items():
-        mine = [line for line in lines if line["benchmark"] == name]
-        if mine:
-            begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
-            block = f"{begin}\n{draw(mine)}\n{end}"
-            page, count = re.subn(
-                f"{re.escape(begin)}.*?{re.escape(end)}", lambda _, b=block: b, page, flags=re.S
-            )
-            assert count == 1, f"{PAGE} has {count} places for {name}"
-    PAGE.write_text(page)
+    for path, drawn in PAGES.items():
+        page = path.read_text()
+        for name, draw in drawn.items():
+            mine = [line for line in lines if line["benchmark"] == name]
+            page = _with_table(page, path, name, draw(mine)) if mine else page
+        path.write_text(page)
+
+
+def _with_table(page: str, path: Path, name: str, text: str) -> str:
+    begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
+    block = f"{begin}\n{text}\n{end}"
+    pattern = f"{re.escape(begin)}.*?{re.escape(end)}"
+    page, count = re.subn(pattern, lambda _: block, page, flags=re.S)
+    assert count == 1, f"{path} has {count} places for {name}"
+    return page
 
 
 if __name__ == "__main__":
