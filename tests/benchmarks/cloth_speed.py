@@ -3,8 +3,8 @@
     python -m tests.benchmarks.cloth_speed --actions 100 --rounds 3
 
 Beside them PyBullet's cloth with the numbers of deformable-ravens makes the same picks and drops on
-a handkerchief of the same size: 10 x 10 vertices, 0.5 kg, spring 40, damping 0.1, friction 1, margin
-a fifth of an edge, 480 steps a second, as in `defs_cloth.py` and `environment.py` of
+a handkerchief of the same size: 10 x 10 vertices, 0.5 kg, spring 40, damping 0.1, friction 1, a
+margin of a fifth of an edge, 480 steps a second, as in `defs_cloth.py` and `environment.py` of
 github.com/DanielTakeshi/deformable-ravens. What is timed is the engine alone; a picture costs less
 than 1 ms.
 """
