@@ -125,6 +125,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._usual_garment = self._make_garment()
         self._conditions = Conditions()
         self._flat_px = 0
+        self._obstacles: tuple[Obstacle | None, ...] = ()
         self.film_every_secs: float | None = None
         """Set it to have each step of the robot filmed; see `robot_film`."""
         self._film: RobotFilm | None = None
@@ -178,6 +179,11 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         return self._scene.garment
 
     @property
+    def obstacles(self) -> tuple[Obstacle | None, ...]:
+        """Why the robot cannot do each action as the cloth lies now; empty without a robot."""
+        return self._obstacles
+
+    @property
     def steps_done(self) -> int:
         """Steps made in this episode."""
         return self._clock.steps_done
@@ -204,6 +210,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
                 attempts.
         """
         super().reset(seed=seed, options=options)
+        self._film = None
         name = (options or {}).get("initial_state", self.options.initial_state)
         check_initial_state(name)
         for _ in range(MOST_START_ATTEMPTS):
@@ -257,7 +264,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     def robot_film(self) -> list[NDArray[np.uint8]]:
         """The robot in the last step, every `film_every_secs`: u8[render_px, render_px, 3] each.
 
-        Empty where it did not move, or was not filmed.
+        Empty where it did not move, was not filmed, or the guard stopped the step.
         """
         film, size_px = self._film, self.options.render_px
         if film is None:
@@ -273,17 +280,6 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock.stop()
         self._scene.close()
 
-    def obstacles(self) -> list[Obstacle | None]:
-        """Why the robot cannot do each action as the cloth lies now; None where it can.
-
-        Without a robot, nothing is in the way of any.
-        """
-        if self._planner is None:
-            return [None] * self.n_actions
-        vertices = self._scene.vertices_in_world()
-        gestures = [self._plan(action).gesture for action in range(self.n_actions)]
-        return [self._planner.obstacle(vertices, gesture) for gesture in gestures]
-
     def _plan_arms(self, gesture: Gesture) -> tuple[MotionPlan | None, Obstacle | None]:
         """The robot's plan, or what is in its way; neither without a robot."""
         if self._planner is None:
@@ -297,7 +293,11 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         """Which actions the robot can make, for `info`."""
         if self._planner is None:
             return {}
-        reachable = [obstacle is None for obstacle in self.obstacles()]
+        vertices, actions = self._scene.vertices_in_world(), range(self.n_actions)
+        self._obstacles = tuple(
+            self._planner.obstacle(vertices, self._plan(action).gesture) for action in actions
+        )
+        reachable = [obstacle is None for obstacle in self._obstacles]
         return {"action_mask": np.array(reachable, dtype=np.int8)}
 
     def _new_scene(self, settings: Settings) -> Scene:
@@ -361,7 +361,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         if not (missed > 0.0 and self.np_random.random() < missed):  # it may close on nothing
             made = gesture if plan is None else plan.carried(gesture)
             reason = self._scene.perform(made, film if self.film_every_secs else None)
-        if plan is not None and self.film_every_secs is not None:
+        if plan is not None and self.film_every_secs is not None and reason is None:
             self._film = RobotFilm(plan, before, film, self._scene.vertices_in_world())
         return reason
 
