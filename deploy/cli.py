@@ -394,6 +394,7 @@ def collect(
 
 
 app.command(name="task")(task_commands.task)
+app.command(name="reach")(task_commands.reach)
 app.command(name="watch")(task_commands.watch)
 
 

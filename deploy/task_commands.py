@@ -1,4 +1,4 @@
-"""The commands that look at a task alone, without bus or learner: `clothbus task` and `watch`."""
+"""The commands that look at a task alone, without bus or learner: `task`, `reach` and `watch`."""
 
 from __future__ import annotations
 
@@ -47,6 +47,30 @@ def task(
         sys.exit(FAILED_CHECK_EXIT)
 
 
+def reach(
+    env_id: Annotated[str, tyro.conf.Positional],
+    /,
+    episodes: int = 10,
+    options: Options = (),
+) -> None:
+    """Say what portion of a task's actions the robot can make, and what is in the way of others.
+
+    Args:
+        env_id: A cloth task's id, such as ShirtFold or clothbus/ShirtFold-v0.
+        episodes: Of the scripted expert.
+        options: Arguments of the environment, such as robot_stance="left".
+    """
+    from deploy.reach_check import check_reach
+
+    if episodes < 1:
+        raise PresetError(f"--episodes: expected at least 1; got {episodes}")
+    try:
+        check = check_reach(_whole_id(env_id), _parsed(options), episodes)
+    except ValueError as error:
+        raise PresetError(str(error)) from error
+    Console().print(check.table())
+
+
 def watch(
     env_id: Annotated[str, tyro.conf.Positional],
     /,
@@ -62,7 +86,8 @@ def watch(
         output: A file that ends in .gif or .mp4.
         who: scripted, random, or a run folder, whose newest policy plays greedily.
         seed: Of the episode.
-        options: Arguments of the environment, such as engine="pybullet" difficulty="hard".
+        options: Arguments of the environment, such as engine="pybullet" difficulty="hard" or
+            robot=true, which shows the arms.
     """
     from deploy.watch import watch as write_episode
 
@@ -71,7 +96,7 @@ def watch(
     except ValueError as error:
         raise PresetError(str(error)) from error
     Console().print(
-        f"{output}: {len(episode.frames) // 2} actions, return {episode.return_:.2f}, "
+        f"{output}: {episode.n_actions} actions, return {episode.return_:.2f}, "
         f"{'success' if episode.success else 'no success'} at the end",
         highlight=False,
     )

@@ -22,6 +22,7 @@ from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore
 
 FRAME_SECS: Final = 0.6
+ROBOT_FRAME_SECS: Final = 0.2
 SIZE_PX: Final = 336
 SUFFIXES: Final = (".gif", ".mp4")
 
@@ -34,7 +35,12 @@ class WatchedEpisode:
     """An episode's pictures and outcome."""
 
     frames: list[Picture]
-    """u8[size, size, 3], twice for each action: what is to be done, what came of it."""
+    """u8[size, size, 3]: at first the cloth; for each action what is to be done, the robot doing
+    it, where there is one, and what came of it."""
+
+    n_actions: int
+    frame_secs: float
+    """How long each is shown: a robot is shown as fast as it moves."""
 
     return_: float
     success: bool
@@ -67,7 +73,7 @@ def watch(
         episode = _played(env, _policy(who, env), seed)
     finally:
         env.close()
-    _write(episode.frames, output)
+    _write(episode, output)
     return episode
 
 
@@ -99,16 +105,36 @@ def _learned(folder: RunFolder, env: ClothbusEnv, n_actions: int) -> Policy:
 
 
 def _played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:
+    frame_secs = _frame_secs(env)
+    stands = round(FRAME_SECS / frame_secs)
     random = np.random.default_rng([seed, 2])
     picture, _ = env.reset(seed=seed)
-    frames, return_, is_over = [_rendered(env)], 0.0, False
+    cloth = _rendered(env)
+    frames, return_, n_actions, is_over = [cloth] * stands, 0.0, 0, False
     while not is_over:
         picture, reward, terminated, truncated, info = env.step(policy.act(picture, random, 0.0))
         return_ += float(reward)
+        n_actions += 1
         is_over = terminated or truncated
-        frames.append(_annotated(env, frames[-1], info))
-        frames.append(frames[-2] if info["guard"] else _rendered(env))
-    return WatchedEpisode(frames, return_, bool(info["success"]))
+        frames += [_annotated(env, cloth, info)] * stands
+        frames += _robot_film(env)
+        cloth = cloth if info["guard"] else _rendered(env)
+        frames += [cloth] * stands
+    return WatchedEpisode(frames, n_actions, frame_secs, return_, bool(info["success"]))
+
+
+def _frame_secs(env: ClothbusEnv) -> float:
+    """How long to show each picture; a robot is filmed from now on."""
+    task = env.unwrapped
+    if not (isinstance(task, ClothTaskEnv) and task.options.robot):
+        return FRAME_SECS
+    task.film_every_secs = ROBOT_FRAME_SECS
+    return ROBOT_FRAME_SECS
+
+
+def _robot_film(env: ClothbusEnv) -> list[Picture]:
+    task = env.unwrapped
+    return task.robot_film() if isinstance(task, ClothTaskEnv) else []
 
 
 def _rendered(env: ClothbusEnv) -> Picture:
@@ -144,16 +170,17 @@ def _annotated(env: ClothbusEnv, frame: Picture, info: Mapping[str, Any]) -> Pic
     return drawn
 
 
-def _write(frames: list[Picture], output: Path) -> None:
+def _write(episode: WatchedEpisode, output: Path) -> None:
+    frames, frame_secs = episode.frames, episode.frame_secs
     output.parent.mkdir(parents=True, exist_ok=True)
     if output.suffix == ".gif":
         first, *rest = [Image.fromarray(frame) for frame in frames]
-        duration_ms = round(1e3 * FRAME_SECS)
+        duration_ms = round(1e3 * frame_secs)
         first.save(output, save_all=True, append_images=rest, duration=duration_ms, loop=0)
         return
     height, width = frames[0].shape[:2]
     codec = cv2.VideoWriter.fourcc(*"mp4v")
-    writer = cv2.VideoWriter(str(output), codec, 1 / FRAME_SECS, (width, height))
+    writer = cv2.VideoWriter(str(output), codec, 1 / frame_secs, (width, height))
     if not writer.isOpened():
         raise StorageError(
             f"{output}: expected a file that can be written; got none; check the folder, or write "

@@ -1,5 +1,6 @@
 """What a cloth engine offers to the tasks, and what can go wrong in one."""
 
+from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -16,6 +17,15 @@ StateT = TypeVar("StateT")
 
 class ClothEngineError(RuntimeError):
     """An engine cannot go on: not reset, closed, or its simulator was lost."""
+
+
+@dataclass
+class Film:
+    """What cloth does while it is carried, seen every so often."""
+
+    every_secs: float
+    frames: list[NDArray[np.float64]] = field(default_factory=list)
+    """f64[V, 3] each, the first when hands have closed; an engine adds to them."""
 
 
 class ClothEngine(Protocol):
@@ -56,13 +66,14 @@ class ClothEngine(Protocol):
         """
         ...
 
-    def perform(self, gesture: Gesture) -> None:
+    def perform(self, gesture: Gesture, film: Film | None = None) -> None:
         """Let hands take hold, move and let go, and let the cloth come to rest.
 
         What a hand holds keeps its shape while it is carried.
 
         Args:
             gesture: of one hand or several, made for where the cloth is now.
+            film: to be filled from closing to opening; it changes nothing else.
 
         Raises:
             ValueError: it names a vertex that the cloth lacks, or one for two hands.

@@ -8,16 +8,20 @@ from actors.cloth.pybullet_process import PyBulletProcessEngine
 from actors.cloth.pybullet_settings import PyBulletSettings
 from actors.cloth.xpbd_engine import XpbdEngine
 from actors.cloth.xpbd_settings import XpbdSettings
+from actors.robot.stances import Stance
 
 Settings = Mapping[str, Any]
 
 
-def make_engine(name: str, settings: Settings | None = None) -> ClothEngine:
+def make_engine(
+    name: str, settings: Settings | None = None, stance: Stance | None = None
+) -> ClothEngine:
     """The engine of a name, not yet reset.
 
     Args:
         name: a key of `ENGINES`.
         settings: the engine's own settings by name, where they differ from its defaults.
+        stance: of the robot, for an engine in whose world it can stand; None: there is no robot.
 
     Raises:
         ValueError: there is no such engine, or it has no such setting, or a setting is out of
@@ -27,7 +31,7 @@ def make_engine(name: str, settings: Settings | None = None) -> ClothEngine:
         raise ValueError(
             f"engine: expected one of {', '.join(sorted(ENGINES))}; got {name!r}; name one of them"
         )
-    return ENGINES[name](settings or {})
+    return ENGINES[name](settings or {}, stance)
 
 
 def with_material(
@@ -56,12 +60,13 @@ def with_material(
     }
 
 
-def _pybullet(settings: Settings) -> ClothEngine:
+def _pybullet(settings: Settings, stance: Stance | None) -> ClothEngine:
     _check_names("pybullet", settings, PyBulletSettings.__dataclass_fields__)
-    return PyBulletProcessEngine(PyBulletSettings(**settings))
+    return PyBulletProcessEngine(PyBulletSettings(**settings), stance)
 
 
-def _xpbd(settings: Settings) -> ClothEngine:
+def _xpbd(settings: Settings, stance: Stance | None) -> ClothEngine:
+    del stance  # it simulates cloth alone: a robot is the path of its fingers
     _check_names("xpbd", settings, XpbdSettings.__dataclass_fields__)
     return XpbdEngine(XpbdSettings(**settings))
 
@@ -75,5 +80,8 @@ def _check_names(engine: str, settings: Settings, known: Mapping[str, object]) -
         )
 
 
-ENGINES: dict[str, Callable[[Settings], ClothEngine]] = {"pybullet": _pybullet, "xpbd": _xpbd}
-"""Each engine's maker, from its settings."""
+ENGINES: dict[str, Callable[[Settings, Stance | None], ClothEngine]] = {
+    "pybullet": _pybullet,
+    "xpbd": _xpbd,
+}
+"""Each engine's maker, from its settings and where a robot stands."""

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.cloth.carried import CarriedPaths
 from actors.cloth.grasps import check_grasp
 
 
@@ -59,6 +60,12 @@ class Hand:
     turn_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
     """Around which it is turned, right-handed; a unit vector."""
 
+    def stations_and_turns(self) -> NDArray[np.float64]:
+        """Points and turns, f64[W, 4]."""
+        n_stations = len(self.stations_in_world)
+        turns = np.zeros(n_stations) if self.turns_rad is None else self.turns_rad
+        return np.concatenate([self.stations_in_world, turns[:, None]], axis=1)
+
     def __post_init__(self) -> None:
         """Check the points and the turns.
 
@@ -89,6 +96,10 @@ class Gesture:
     """At least one, each with as many stations as the others."""
 
     motion: GripperMotion = field(default_factory=GripperMotion)
+
+    paths: CarriedPaths | None = None
+    """How the hands really move, where a robot was planned for; else straight from station to
+    station."""
 
     def __post_init__(self) -> None:
         """Check that the hands fit each other.
@@ -152,15 +163,19 @@ def hand_paths_in_world(
 
     Args:
         starts_in_world: f64[H, 3], where each hand closed, metres.
-        gesture: stations and speed, which the hand with the longest way has.
+        gesture: its paths, or else stations and speed, which the hand with the longest way has.
         time_step_secs: time between two rows.
 
     Returns:
         f64[K, H, 4], without the start and with the end: position in metres, then how far the hand
         is turned around its axis, rad.
     """
+    if gesture.paths is not None:
+        rows = gesture.paths.hands_at(gesture.paths.steps_secs(time_step_secs))
+        rows[..., :3] += starts_in_world - gesture.paths.positions_in_world[0]
+        return rows
     starts = np.concatenate([starts_in_world, np.zeros((len(starts_in_world), 1))], axis=1)
-    stations = np.stack([_stations(hand) for hand in gesture.hands], axis=1)
+    stations = np.stack([hand.stations_and_turns() for hand in gesture.hands], axis=1)
     step_m = gesture.motion.speed_m_per_s * time_step_secs
     return np.concatenate([_leg(a, b, step_m) for a, b in pairwise([starts, *stations])])
 
@@ -171,13 +186,6 @@ def turns_in_world(hand: Hand, turns_rad: NDArray[np.float64]) -> NDArray[np.flo
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sines, cosines = np.sin(turns_rad)[:, None, None], np.cos(turns_rad)[:, None, None]
     return np.asarray(np.eye(3) + sines * cross + (1.0 - cosines) * (cross @ cross))
-
-
-def _stations(hand: Hand) -> NDArray[np.float64]:
-    """f64[W, 4]: position and turn."""
-    n_stations = len(hand.stations_in_world)
-    turns = np.zeros(n_stations) if hand.turns_rad is None else hand.turns_rad
-    return np.concatenate([hand.stations_in_world, turns[:, None]], axis=1)
 
 
 def _leg(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from actors.cloth.engine import (
     TABLE_HALF_WIDTH_M,
     ClothEngineError,
+    Film,
     checked_vertices,
 )
 from actors.cloth.gestures import Gesture, Hand, hand_paths_in_world
@@ -19,6 +20,9 @@ from actors.cloth.meshes import ClothMesh
 from actors.cloth.obj_files import write_obj
 from actors.cloth.pybullet_settings import PyBulletSettings
 from actors.cloth.quiet_pybullet import pybullet
+from actors.robot.body import RobotBody
+from actors.robot.model import WITHDRAWN_POSE_RAD
+from actors.robot.stances import Stance
 
 TABLE_THICKNESS_M = 0.1
 SETTLE_AFTER_RESET_SECS = 0.05
@@ -35,9 +39,13 @@ class PyBulletEngine:
 
     settings: PyBulletSettings = field(default_factory=PyBulletSettings)
 
+    stance: Stance | None = None
+    """Where a robot stands in the same world; None: there is none."""
+
     def __post_init__(self) -> None:
         """Begin without a world; `reset` makes it."""
         self._client: int | None = None
+        self._robot: RobotBody | None = None
         self._cloth = -1
         self._mesh: ClothMesh | None = None
 
@@ -61,6 +69,7 @@ class PyBulletEngine:
         vertices[:, 2] += self.settings.collision_margin_m
         self._empty_world()
         self._add_table()
+        self._robot = self._new_robot()
         self._cloth = self._load(mesh)
         self._mesh = mesh
         pybullet.resetMeshData(self._cloth, vertices.tolist(), physicsClientId=self._client)
@@ -83,18 +92,20 @@ class PyBulletEngine:
             )
         return array
 
-    def perform(self, gesture: Gesture) -> None:
+    def perform(self, gesture: Gesture, film: Film | None = None) -> None:
         """Let hands move the cloth; see `ClothEngine.perform`."""
         gesture.check(len(self.mesh.vertices_m))
         vertices = self.vertices_in_world()
         starts = np.stack([vertices[hand.grasped[0]] for hand in gesture.hands])
-        paths = hand_paths_in_world(starts, gesture, self.settings.time_step_secs)
+        every = None if film is None else max(1, round(film.every_secs / self._step_secs))
         with ExitStack() as held:
             grippers = [
                 held.enter_context(self._grasp(hand, start))
                 for hand, start in zip(gesture.hands, starts, strict=True)
             ]
-            for row in paths.tolist():
+            for step, row in enumerate(self._hand_rows(starts, gesture)):
+                if film is not None and every is not None and step % every == 0:
+                    film.frames.append(self.vertices_in_world())
                 for hand, gripper, (*position, turn_rad) in zip(
                     gesture.hands, grippers, row, strict=True
                 ):
@@ -103,7 +114,34 @@ class PyBulletEngine:
                         gripper, position, turned, physicsClientId=self._client
                     )
                 pybullet.stepSimulation(physicsClientId=self._client)
+        if self._robot is not None:
+            self._robot.pose(np.array(WITHDRAWN_POSE_RAD))
         self._simulate(gesture.motion.settle_secs)
+
+    def _hand_rows(
+        self, starts: NDArray[np.float64], gesture: Gesture
+    ) -> Iterator[list[list[float]]]:
+        """Position and turn of each hand after each step; a robot in this world is posed first.
+
+        Its fingers' positions are then those that PyBullet finds for its joints.
+        """
+        rows = hand_paths_in_world(starts, gesture, self._step_secs)
+        paths, robot = gesture.paths, self._robot
+        if paths is None or robot is None:
+            yield from rows.tolist()
+            return
+        robot.pose(paths.joints_rad[0])
+        offsets_m = starts - [robot.fingers_in_world(arm) for arm in paths.arms]
+        for row, joints in zip(
+            rows, paths.joints_at(paths.steps_secs(self._step_secs)), strict=True
+        ):
+            robot.pose(joints)
+            row[:, :3] = offsets_m + [robot.fingers_in_world(arm) for arm in paths.arms]
+            yield row.tolist()
+
+    @property
+    def _step_secs(self) -> float:
+        return self.settings.time_step_secs
 
     def close(self) -> None:
         """Give the world back; may be called twice."""
@@ -136,6 +174,13 @@ class PyBulletEngine:
             0, shape, -1, [0.0, 0.0, -TABLE_THICKNESS_M / 2], physicsClientId=self._client
         )
         pybullet.changeDynamics(table, -1, lateralFriction=1.0, physicsClientId=self._client)
+
+    def _new_robot(self) -> RobotBody | None:
+        if self.stance is None:
+            return None
+        assert self._client is not None
+        # Not solid: its fingers would push away the very cloth that they hold.
+        return RobotBody(self._client, self.stance, solid=False)
 
     def _load(self, mesh: ClothMesh) -> int:
         settings = self.settings

@@ -11,17 +11,18 @@ import sys
 import tempfile
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NoReturn
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.cloth.engine import ClothEngineError, checked_vertices
+from actors.cloth.engine import ClothEngineError, Film, checked_vertices
 from actors.cloth.frames import read_frame, write_frame
 from actors.cloth.gestures import Gesture
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.pybullet_settings import PyBulletSettings
+from actors.robot.stances import Stance
 
 REPLY_TIMEOUT_SECS = 120.0  # an action takes half a second; a crowded machine, some seconds
 _PACKAGES = Path(__file__).resolve().parents[2]
@@ -36,6 +37,9 @@ class PyBulletProcessEngine:
     """
 
     settings: PyBulletSettings = field(default_factory=PyBulletSettings)
+    stance: Stance | None = None
+    """Where a robot stands in the cloth's world; None: there is none."""
+
     reply_timeout_secs: float = REPLY_TIMEOUT_SECS
 
     def __post_init__(self) -> None:
@@ -71,6 +75,7 @@ class PyBulletProcessEngine:
         self._ask(
             {
                 "settings": asdict(self.settings),
+                "stance": None if self.stance is None else asdict(self.stance),
                 "mesh_vertices": mesh.vertices_m.tobytes(),
                 "faces": mesh.faces.tobytes(),
                 "vertices": vertices.tobytes(),
@@ -83,7 +88,7 @@ class PyBulletProcessEngine:
         assert len(self._vertices) == len(self.mesh.vertices_m)
         return self._vertices.copy()
 
-    def perform(self, gesture: Gesture) -> None:
+    def perform(self, gesture: Gesture, film: Film | None = None) -> None:
         """Let hands move the cloth; see `ClothEngine.perform`."""
         gesture.check(len(self.mesh.vertices_m))
         hands = [
@@ -95,7 +100,16 @@ class PyBulletProcessEngine:
             }
             for hand in gesture.hands
         ]
-        self._ask({"hands": hands, "motion": asdict(gesture.motion)})
+        frames = self._ask(
+            {
+                "hands": hands,
+                "motion": asdict(gesture.motion),
+                "paths": None if gesture.paths is None else gesture.paths.to_wire(),
+                "film_every_secs": None if film is None else film.every_secs,
+            }
+        )
+        if film is not None:
+            film.frames += frames
 
     def close(self) -> None:
         """End the process; may be called twice."""
@@ -132,7 +146,8 @@ class PyBulletProcessEngine:
                 "check the limits on processes and open files"
             ) from error
 
-    def _ask(self, request: dict[str, Any]) -> None:
+    def _ask(self, request: dict[str, Any]) -> list[NDArray[np.float64]]:
+        """Send a request, take the vertices from its reply, and return what was filmed."""
         worker = self._worker
         assert worker is not None
         assert worker.stdin is not None
@@ -141,6 +156,7 @@ class PyBulletProcessEngine:
             write_frame(worker.stdin.fileno(), msgpack.packb(request))
             reply = msgpack.unpackb(read_frame(worker.stdout.fileno(), self.reply_timeout_secs))
             self._vertices = np.frombuffer(reply["vertices"]).reshape(-1, 3)
+            return [np.frombuffer(frame).reshape(-1, 3) for frame in reply["film"]]
         except TimeoutError as error:
             self._lost(f"no answer within {self.reply_timeout_secs:g} s", error)
         except (BrokenPipeError, EOFError, ValueError, KeyError) as error:
@@ -149,7 +165,7 @@ class PyBulletProcessEngine:
             self.close()  # interrupted halfway: the next answer would belong to this request
             raise
 
-    def _lost(self, what: str, error: Exception) -> None:
+    def _lost(self, what: str, error: Exception) -> NoReturn:
         last_words = self._last_words()
         self.close()
         raise ClothEngineError(

@@ -14,11 +14,14 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.cloth.carried import CarriedPaths
+from actors.cloth.engine import Film
 from actors.cloth.frames import read_frame, write_frame
 from actors.cloth.gestures import Gesture, GripperMotion, Hand
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.pybullet_engine import PyBulletEngine
 from actors.cloth.pybullet_settings import PyBulletSettings
+from actors.robot.stances import Stance
 
 
 def serve(requests: int, replies: int) -> None:
@@ -29,9 +32,16 @@ def serve(requests: int, replies: int) -> None:
         BrokenPipeError: nobody reads the replies.
     """
     engine = _engine_with_cloth(msgpack.unpackb(read_frame(requests)))
+    film = Film(np.inf)
     while True:
-        write_frame(replies, msgpack.packb({"vertices": engine.vertices_in_world().tobytes()}))
-        engine.perform(_gesture(msgpack.unpackb(read_frame(requests))))
+        reply = {
+            "vertices": engine.vertices_in_world().tobytes(),
+            "film": [frame.tobytes() for frame in film.frames],
+        }
+        write_frame(replies, msgpack.packb(reply))
+        request = msgpack.unpackb(read_frame(requests))
+        film = Film(request["film_every_secs"] or np.inf)
+        engine.perform(_gesture(request), film if request["film_every_secs"] else None)
 
 
 def main() -> None:
@@ -45,7 +55,8 @@ def main() -> None:
 
 
 def _engine_with_cloth(request: dict[str, Any]) -> PyBulletEngine:
-    engine = PyBulletEngine(PyBulletSettings(**request["settings"]))
+    stance = None if request["stance"] is None else Stance(**request["stance"])
+    engine = PyBulletEngine(PyBulletSettings(**request["settings"]), stance)
     faces = np.frombuffer(request["faces"], dtype=np.int32).reshape(-1, 3)
     mesh = ClothMesh(_points(request["mesh_vertices"]), faces)
     engine.reset(mesh, _points(request["vertices"]))
@@ -62,7 +73,8 @@ def _gesture(request: dict[str, Any]) -> Gesture:
         )
         for hand in request["hands"]
     ]
-    return Gesture(tuple(hands), GripperMotion(**request["motion"]))
+    paths = None if request["paths"] is None else CarriedPaths.from_wire(request["paths"])
+    return Gesture(tuple(hands), GripperMotion(**request["motion"]), paths)
 
 
 def _points(raw: bytes) -> NDArray[np.float64]:

@@ -1,11 +1,17 @@
 """The fast engine: XPBD cloth that repeats itself bit by bit and returns to any saved state."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.cloth.engine import TABLE_HALF_WIDTH_M, ClothEngineError, checked_vertices
+from actors.cloth.engine import (
+    TABLE_HALF_WIDTH_M,
+    ClothEngineError,
+    Film,
+    checked_vertices,
+)
 from actors.cloth.gestures import Gesture, hand_paths_in_world, turns_in_world
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.xpbd_constraints import distance_constraints
@@ -76,13 +82,14 @@ class XpbdEngine:
         _ = self.mesh
         return np.ascontiguousarray(self._body.positions_m.T)
 
-    def perform(self, gesture: Gesture) -> None:
+    def perform(self, gesture: Gesture, film: Film | None = None) -> None:
         """Let hands move the cloth; see `ClothEngine.perform`."""
         gesture.check(len(self.mesh.vertices_m))
         grasped = np.concatenate([hand.grasped for hand in gesture.hands])
         path_m = self._grasped_path_m(gesture)
         self._hold(grasped)
-        self._advance(len(path_m), grasped, path_m)
+        for piece_m in self._pieces(path_m, film):
+            self._advance(len(piece_m), grasped, piece_m)
         self._hold(_NOTHING)
         self._body.velocities_m_per_s[:, grasped] = 0.0  # fingers stop before they open
         self._settle(gesture.motion.settle_secs)
@@ -170,6 +177,18 @@ class XpbdEngine:
             way_m[:, :, 2] += np.maximum(too_deep_m, 0.0)[:, None]
             held_m.append(way_m)
         return np.concatenate(held_m, axis=1)
+
+    def _pieces(
+        self, path_m: NDArray[np.float64], film: Film | None
+    ) -> Iterator[NDArray[np.float64]]:
+        """A path f64[K, k, 3], whole, or cut where the cloth is filmed before it goes on."""
+        if film is None:
+            yield path_m
+            return
+        n_substeps = max(1, round(film.every_secs / self._numbers.substep_secs))
+        for first in range(0, len(path_m), n_substeps):
+            film.frames.append(self.vertices_in_world())
+            yield path_m[first : first + n_substeps]
 
     def _settle(self, least_secs: float) -> None:
         """Waits until the cloth lies still, at least and at most for a time."""

@@ -120,7 +120,10 @@ _TASKS: Final[Mapping[str, _Task]] = {
         FoldLinesEnv, {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}, FOLDING
     ),
     "clothbus/HandkerchiefFold-v0": _ClothTask(
-        FoldLinesEnv, {"garment": "handkerchief"}, {"horizon": 2, "observation_px": 32}, FOLDING
+        FoldLinesEnv,
+        {"garment": "handkerchief"},
+        {"horizon": 2, "observation_px": 32, "robot_stance": "left"},
+        FOLDING,
     ),
 }
 

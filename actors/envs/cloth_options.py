@@ -9,6 +9,7 @@ from actors.cloth.engines import Settings
 from actors.envs.arguments import check_range, check_render_mode, check_size
 from actors.envs.initial_states import InitialState, check_initial_state
 from actors.envs.randomisation import Randomisation, make_randomisation
+from actors.robot.stances import check_stance
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,10 @@ class ClothTaskOptions:
     """A name, or ranges; see `actors.envs.randomisation`."""
 
     robot: bool = False
-    """Plan each gesture for the robot's arms; what they cannot do is not done."""
+    """The robot makes each gesture, as fast as it can; what its arms cannot do is not done."""
+
+    robot_stance: str = "front"
+    """Where it stands; see `actors.robot.stances`."""
 
     observation_px: int = 84
     """Width and height of the observation."""
@@ -77,3 +81,4 @@ class ClothTaskOptions:
         check_initial_state(self.initial_state)
         check_render_mode(self.render_mode)
         make_randomisation(self.randomisation)
+        check_stance(self.robot_stance)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.engine import ClothEngineError
+from actors.cloth.engine import ClothEngineError, Film
 from actors.cloth.engines import Settings, make_engine, with_material
 from actors.cloth.garments import (
     Garment,
@@ -39,9 +39,11 @@ from actors.envs.initial_states import (
     initial_pose,
 )
 from actors.envs.randomisation import Conditions, make_randomisation
+from actors.envs.robot_film import RobotFilm
 from actors.envs.scene import Look, Scene
-from actors.robot.planning import STEP_M, Obstacle
-from actors.robot.reach import Reach
+from actors.robot.motion import MotionPlan
+from actors.robot.planning import ArmPlanner, Obstacle, UnreachableError
+from actors.robot.stances import STANCES
 
 MOST_START_ATTEMPTS: Final = 5
 
@@ -118,11 +120,15 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock = EpisodeClock(options.horizon)
         usual = (usual_settings or {}).get(options.engine, {})
         self._engine_settings = {**usual, **(options.engine_settings or {})}
-        self._scene = Scene(make_engine(options.engine, self._engine_settings))
+        self._planner = ArmPlanner(STANCES[options.robot_stance]) if options.robot else None
+        self._scene = self._new_scene(self._engine_settings)
         self._usual_garment = self._make_garment()
         self._conditions = Conditions()
         self._flat_px = 0
-        self._reach: Reach | None = None
+        self._obstacles: tuple[Obstacle | None, ...] = ()
+        self.film_every_secs: float | None = None
+        """Set it to have each step of the robot filmed; see `robot_film`."""
+        self._film: RobotFilm | None = None
         shape = (options.observation_px, options.observation_px, 3)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Discrete(n_actions)
@@ -173,6 +179,11 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         return self._scene.garment
 
     @property
+    def obstacles(self) -> tuple[Obstacle | None, ...]:
+        """Why the robot cannot do each action as the cloth lies now; empty without a robot."""
+        return self._obstacles
+
+    @property
     def steps_done(self) -> int:
         """Steps made in this episode."""
         return self._clock.steps_done
@@ -207,6 +218,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
                 attempts.
         """
         super().reset(seed=seed, options=options)
+        self._film = None
         name = (options or {}).get("initial_state", self.options.initial_state)
         check_initial_state(name)
         for _ in range(MOST_START_ATTEMPTS):
@@ -232,8 +244,9 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock.check_running()
         index = checked_action(action, self.n_actions)
         planned = self._plan(index)
-        unreachable = self._obstacle(planned.gesture)
-        reason = self._perform(planned.gesture) if unreachable is None else None
+        self._film = None
+        plan, unreachable = self._plan_arms(planned.gesture)
+        reason = self._perform(planned.gesture, plan) if unreachable is None else None
         truncated = self._clock.tick()
         reward, measures = self._judge()
         if reason is not None:
@@ -256,33 +269,48 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             return None
         return self._scene.drawn(self._conditions.moved(self._render_camera))
 
+    def robot_film(self) -> list[NDArray[np.uint8]]:
+        """The robot in the last step, every `film_every_secs`: u8[render_px, render_px, 3] each.
+
+        Empty where it did not move, was not filmed, or the guard stopped the step.
+        """
+        film, size_px = self._film, self.options.render_px
+        if film is None:
+            return []
+        scene = self._scene
+        return [
+            film.picture(time_secs, scene.garment, scene.look, size_px)
+            for time_secs in film.times_secs().tolist()
+        ]
+
     def close(self) -> None:
         """End the simulator; may be called twice."""
         self._clock.stop()
         self._scene.close()
-        if self._reach is not None:
-            self._reach.close()
-            self._reach = None
 
-    def _arms(self) -> Reach:
-        if self._reach is None:
-            self._reach = Reach()
-        return self._reach
-
-    def _obstacle(self, gesture: Gesture) -> Obstacle | None:
-        """Why the robot cannot make a gesture; None where it can, or there is no robot."""
-        if not self.options.robot:
-            return None
-        return self._arms().obstacle(self._scene.vertices_in_world(), gesture, STEP_M)
+    def _plan_arms(self, gesture: Gesture) -> tuple[MotionPlan | None, Obstacle | None]:
+        """The robot's plan, or what is in its way; neither without a robot."""
+        if self._planner is None:
+            return None, None
+        try:
+            return self._planner.plan(self._scene.vertices_in_world(), gesture), None
+        except UnreachableError as error:
+            return None, error.obstacle
 
     def _mask(self) -> dict[str, Any]:
         """Which actions the robot can make, for `info`."""
-        if not self.options.robot:
+        if self._planner is None:
             return {}
-        vertices = self._scene.vertices_in_world()
-        gestures = [self._plan(action).gesture for action in range(self.n_actions)]
-        reachable = [self._arms().obstacle(vertices, it, np.inf) is None for it in gestures]
+        vertices, actions = self._scene.vertices_in_world(), range(self.n_actions)
+        self._obstacles = tuple(
+            self._planner.obstacle(vertices, self._plan(action).gesture) for action in actions
+        )
+        reachable = [obstacle is None for obstacle in self._obstacles]
         return {"action_mask": np.array(reachable, dtype=np.int8)}
+
+    def _new_scene(self, settings: Settings) -> Scene:
+        stance = None if self._planner is None else self._planner.stance
+        return Scene(make_engine(self.options.engine, settings, stance))
 
     def _try_start(self, name: InitialState) -> GuardReason | None:
         random = self.np_random
@@ -334,11 +362,16 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
                 return reason
         return None
 
-    def _perform(self, gesture: Gesture) -> GuardReason | None:
+    def _perform(self, gesture: Gesture, plan: MotionPlan | None) -> GuardReason | None:
         missed = self._randomisation.missed_grasps
-        if missed > 0.0 and self.np_random.random() < missed:
-            return None  # the gripper closed on nothing
-        return self._scene.perform(gesture)
+        film, before = Film(self.film_every_secs or np.inf), self._scene.vertices_in_world()
+        reason = None
+        if not (missed > 0.0 and self.np_random.random() < missed):  # it may close on nothing
+            made = gesture if plan is None else plan.carried(gesture)
+            reason = self._scene.perform(made, film if self.film_every_secs else None)
+        if plan is not None and self.film_every_secs is not None and reason is None:
+            self._film = RobotFilm(plan, before, film, self._scene.vertices_in_world())
+        return reason
 
     def _use_material(self) -> None:
         conditions, engine = self._conditions, self.options.engine
@@ -351,7 +384,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             friction=conditions.friction,
         )
         self._scene.close()
-        self._scene = Scene(make_engine(engine, settings))
+        self._scene = self._new_scene(settings)
 
     def _make_garment(self, scale: float = 1.0) -> Garment:
         options = self.options

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.engine import ClothEngine, ClothEngineError
+from actors.cloth.engine import ClothEngine, ClothEngineError, Film
 from actors.cloth.garments import Garment
 from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason, guard
@@ -128,10 +128,10 @@ class Scene:
         self._engine.reset(garment.mesh, vertices_in_world)
         return self._see()
 
-    def perform(self, gesture: Gesture) -> GuardReason | None:
+    def perform(self, gesture: Gesture, film: Film | None = None) -> GuardReason | None:
         """Make a gesture and look; why the cloth is not in order afterwards, None where it is."""
         try:
-            self._engine.perform(gesture)
+            self._engine.perform(gesture, film)
         except ClothEngineError:
             return GuardReason.ENGINE_LOST
         return self._see()

@@ -1,7 +1,7 @@
 """The robot's joints and a body of simple shapes, as a URDF that PyBullet loads.
 
 Frames, limits and axes are those of the NEXTAGE OPEN (facts from its published description, BSD
-part of rtmros_nextage). Links are boxes, spheres and cylinders of about the robot's dimensions:
+part of rtmros_nextage). Links are boxes and rods with round ends of about the robot's dimensions:
 **assumed**, as is the gripper, which points down when the forearm is level.
 
 Robot frame: origin at the waist, x forward, y left, z up, metres.
@@ -23,6 +23,44 @@ SPEED_RAD_PER_S: Final = 0.5
 
 
 @dataclass(frozen=True)
+class Box:
+    """A box along the axes of its link's frame."""
+
+    size_m: tuple[float, float, float]
+    centre_m: tuple[float, float, float]
+
+    def urdf(self, purpose: str) -> str:
+        """As a "visual" or a "collision"."""
+        return _shape(
+            purpose, f'<box size="{_words(self.size_m)}"/>', self.centre_m, (0.0, 0.0, 0.0)
+        )
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A cylinder with round ends along an axis of its link's frame: a capsule."""
+
+    radius_m: float
+    length_m: float
+    """From end to end."""
+
+    centre_m: tuple[float, float, float]
+    along: int = 2
+    """The axis: 0, 1 or 2."""
+
+    @property
+    def core_m(self) -> float:
+        """The length without its round ends."""
+        return self.length_m - 2 * self.radius_m
+
+    def urdf(self, purpose: str) -> str:
+        """As a "visual" or a "collision"."""
+        geometry = f'<capsule radius="{self.radius_m:g}" length="{self.core_m:g}"/>'
+        turns = ((0.0, pi / 2, 0.0), (pi / 2, 0.0, 0.0), (0.0, 0.0, 0.0))
+        return _shape(purpose, geometry, self.centre_m, turns[self.along])
+
+
+@dataclass(frozen=True)
 class Joint:
     """A revolute joint and the link that it moves."""
 
@@ -39,8 +77,8 @@ class Joint:
     axis: tuple[int, int, int]
     lower_rad: float
     upper_rad: float
-    shapes: str
-    """Of the moved link, in URDF."""
+    body: Box | Rod
+    """Of the moved link."""
 
     @property
     def link(self) -> str:
@@ -48,27 +86,9 @@ class Joint:
         return self.name.replace("JOINT", "LINK")
 
 
-def box(size_m: tuple[float, float, float], centre_m: tuple[float, float, float]) -> str:
-    """A box in URDF, for the eye and for collisions."""
-    return _shape(f'<box size="{_words(size_m)}"/>', centre_m, (0.0, 0.0, 0.0))
-
-
-def rod(
-    radius_m: float,
-    length_m: float,
-    centre_m: tuple[float, float, float],
-    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> str:
-    """A cylinder along z before it is turned, in URDF."""
-    return _shape(f'<cylinder radius="{radius_m}" length="{length_m}"/>', centre_m, rpy_rad)
-
-
-def _shape(geometry: str, centre: tuple[float, ...], rpy: tuple[float, ...]) -> str:
+def _shape(purpose: str, geometry: str, centre: tuple[float, ...], rpy: tuple[float, ...]) -> str:
     origin = f'<origin xyz="{_words(centre)}" rpy="{_words(rpy)}"/>'
-    return "\n".join(  # PyBullet reads long lines in pieces
-        f"<{what}>{origin}<geometry>{geometry}</geometry></{what}>"
-        for what in ("visual", "collision")
-    )
+    return f"<{purpose}>{origin}<geometry>{geometry}</geometry></{purpose}>"
 
 
 def _words(numbers: tuple[float, ...]) -> str:
@@ -85,27 +105,27 @@ def _arm(arm: Arm) -> list[Joint]:
         return f"{letter}ARM_LINK{index}"
 
     wrist = (-1.8326, 2.87979) if arm == "left" else (-2.87979, 1.8326)
-    gripper = rod(0.016, GRIPPER_LENGTH_M, (-GRIPPER_LENGTH_M / 2, 0.0, 0.0), (0.0, pi / 2, 0.0))
+    gripper = Rod(0.016, GRIPPER_LENGTH_M, (-GRIPPER_LENGTH_M / 2, 0.0, 0.0), along=0)
     return [
         Joint(
             name(0), "CHEST_LINK0", (0.0, side * 0.145, 0.370296), -side * 0.2618, (0, 0, 1),
-            -1.53589, 1.53589, rod(0.05, 0.08, (0.0, 0.0, 0.0)),
+            -1.53589, 1.53589, Rod(0.05, 0.11, (0.0, 0.0, 0.0)),
         ),
         Joint(
             name(1), link(0), (0.0, 0.0, 0.0), 0.0, (0, 1, 0), -2.44346, 1.0472,
-            rod(0.035, 0.2, (0.0, side * 0.07, -0.12)),
+            Rod(0.035, 0.2, (0.0, side * 0.07, -0.12)),
         ),
         Joint(
             name(2), link(1), (0.0, side * 0.095, -0.25), 0.0, (0, 1, 0), -2.75762, 0.0,
-            rod(0.04, 0.09, (-0.015, -side * 0.02, 0.0), (pi / 2, 0.0, 0.0)),
+            Rod(0.04, 0.09, (-0.015, -side * 0.02, 0.0), along=1),
         ),
         Joint(
             name(3), link(2), (-0.03, 0.0, 0.0), 0.0, (0, 0, 1), *wrist,
-            rod(0.035, 0.16, (0.0, 0.0, -0.11)),
+            Rod(0.035, 0.2, (0.0, 0.0, -0.115)),
         ),
         Joint(
             name(4), link(3), (0.0, 0.0, -0.235), 0.0, (0, 1, 0), -1.74533, 1.74533,
-            rod(0.03, 0.08, (-0.02, 0.0, -0.045)),
+            Rod(0.03, 0.08, (-0.02, 0.0, -0.045)),
         ),
         Joint(
             name(5), link(4), (-0.047, 0.0, -0.09), 0.0, (1, 0, 0), -2.84489, 2.84489, gripper,
@@ -116,15 +136,15 @@ def _arm(arm: Arm) -> list[Joint]:
 JOINTS: Final[tuple[Joint, ...]] = (
     Joint(
         "CHEST_JOINT0", "WAIST", (0.0, 0.0, 0.0), 0.0, (0, 0, 1), -2.84489, 2.84489,
-        box((0.14, 0.12, 0.36), (-0.03, 0.0, 0.2)),
+        Box((0.14, 0.12, 0.36), (-0.03, 0.0, 0.2)),
     ),
     Joint(
         "HEAD_JOINT0", "CHEST_LINK0", (0.0, 0.0, 0.5695), 0.0, (0, 0, 1), -1.22173, 1.22173,
-        rod(0.03, 0.12, (0.0, 0.0, -0.08)),
+        Rod(0.03, 0.12, (0.0, 0.0, -0.08)),
     ),
     Joint(
         "HEAD_JOINT1", "HEAD_LINK0", (0.0, 0.0, 0.0), 0.0, (0, 1, 0), -0.349, 1.22173,
-        box((0.14, 0.16, 0.12), (0.02, 0.0, 0.06)),
+        Box((0.14, 0.16, 0.12), (0.02, 0.0, 0.06)),
     ),
     *_arm("right"),
     *_arm("left"),
@@ -132,15 +152,25 @@ JOINTS: Final[tuple[Joint, ...]] = (
 """All 15, parents before children."""
 
 JOINT_NAMES: Final = tuple(joint.name for joint in JOINTS)
+CHEST_JOINT: Final = JOINT_NAMES.index("CHEST_JOINT0")
 
-_RIGHT_INITIAL_DEG = (-0.6, 0.0, -100.0, 15.2, 9.4, 3.2)
+
+def _both_arms(left_rad: tuple[float, ...]) -> tuple[float, ...]:
+    """All joints in the order of `JOINTS` for a left arm's six, the right arm mirrored."""
+    mirrored = (-1, 1, 1, -1, 1, -1)
+    right_rad = [sign * angle for sign, angle in zip(mirrored, left_rad, strict=True)]
+    return (0.0, 0.0, 0.0, *right_rad, *left_rad)
+
+
 _LEFT_INITIAL_DEG = (0.6, 0.0, -100.0, -15.2, 9.4, -3.2)
-INITIAL_POSE_RAD: Final = tuple(
-    degrees * pi / 180 for degrees in (0.0, 0.0, 0.0, *_RIGHT_INITIAL_DEG, *_LEFT_INITIAL_DEG)
-)
-"""Of each joint in the order of `JOINTS`: both forearms level over the table."""
+INITIAL_POSE_RAD: Final = _both_arms(tuple(degrees * pi / 180 for degrees in _LEFT_INITIAL_DEG))
+"""The robot's own: both forearms level over the table, the hands down. Angles are looked for from
+here; with the gripper of this model its fingers are at the table's height."""
 
-FINGERS: Final = {"left": "L_FINGERS", "right": "R_FINGERS"}
+WITHDRAWN_POSE_RAD: Final = _both_arms((0.75, -0.05, -2.55, -0.75, 0.55, 0.0))
+"""Where arms rest: beside the body, out of the picture. **assumed**"""
+
+FINGERS: Final[dict[Arm, str]] = {"left": "L_FINGERS", "right": "R_FINGERS"}
 """Links without a body at the fingers' tips."""
 
 
@@ -150,15 +180,22 @@ def arm_joints(arm: Arm) -> list[int]:
     return [i for i, name in enumerate(JOINT_NAMES) if name.startswith(f"{letter}ARM")]
 
 
-def urdf() -> str:
-    """The robot as a URDF document."""
+def urdf(*, solid: bool = True) -> str:
+    """The robot as a URDF document. Links have no mass, so that they stay as they are posed.
+
+    Args:
+        solid: whether bodies can touch each other and what else there is.
+    """
     inertia = (
-        '<inertial><mass value="1"/>'
-        '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+        '<inertial><mass value="0"/>'
+        '<inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial>'
     )
+    purposes = ("visual", "collision") if solid else ("visual",)
     parts = [f'<link name="WAIST">{inertia}</link>']
     for joint in JOINTS:
-        parts.append(f'<link name="{joint.link}">{inertia}{joint.shapes}</link>')
+        bodies = "\n".join(joint.body.urdf(purpose) for purpose in purposes)
+        # PyBullet reads long lines in pieces.
+        parts.append(f'<link name="{joint.link}">\n{inertia}\n{bodies}\n</link>')
         parts.append(
             f'<joint name="{joint.name}" type="revolute">'
             f'<parent link="{joint.parent}"/><child link="{joint.link}"/>'
@@ -168,7 +205,7 @@ def urdf() -> str:
             f'velocity="{SPEED_RAD_PER_S:g}"/></joint>'
         )
     for arm, fingers in FINGERS.items():
-        last = JOINTS[arm_joints("left" if arm == "left" else "right")[-1]].link
+        last = JOINTS[arm_joints(arm)[-1]].link
         parts.append(f'<link name="{fingers}">{inertia}</link>')
         parts.append(
             f'<joint name="{fingers}_JOINT" type="fixed"><parent link="{last}"/>'

@@ -1,46 +1,60 @@
 """Plans the arms' motion for a gesture, and says why there is none: before anything moves.
 
 The fingers point down, so that cloth that is folded over turns between them; a plan knows no turns
-of the hand. Positions come from inverse kinematics by damped least squares, each point of the way
-starting from the one before.
+of the hand. Positions come from inverse kinematics, each point of the way starting from the one
+before; the chest turns along. The way is tried with the chest begun in several directions, and with
+either arm. What is checked is the whole way on which the joints really go, between its points too.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
-from itertools import pairwise
-from typing import Final
+from itertools import pairwise, product
+from typing import Final, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.gestures import Gesture
-from actors.robot.body import RobotBody
-from actors.robot.model import ARMS, INITIAL_POSE_RAD, JOINTS, SPEED_RAD_PER_S, Arm, arm_joints
-
-POSITION_TOLERANCE_M: Final = 0.002
-MOST_TILT_RAD: Final = 0.35
-"""The fingers may point so far away from straight down."""
+from actors.robot.clearance import dense, least_clearances_m
+from actors.robot.inverse_kinematics import Solution, solve
+from actors.robot.kinematics import fingertips_in_robot
+from actors.robot.model import (
+    ARMS,
+    CHEST_JOINT,
+    INITIAL_POSE_RAD,
+    SPEED_RAD_PER_S,
+    WITHDRAWN_POSE_RAD,
+    Arm,
+    arm_joints,
+)
+from actors.robot.motion import MotionPlan
+from actors.robot.stances import Stance
 
 STEP_M: Final = 0.02
 """Inverse kinematics is solved at least so often along the way."""
 
+CHECK_RAD: Final = 0.05
+"""Clearances are looked at whenever a joint has moved so far."""
+
 ABOVE_M: Final = 0.08
 """Hands come down on the cloth, and leave it, from so far above."""
 
-LEAST_CLEARANCE_M: Final = 0.005
-HANDS_APART_M: Final = 0.045
-"""Fingers are two cylinders of 3.2 cm."""
+LEAST_CLEARANCE_M: Final = 0.01
+"""Of links from each other, and of arms from the table."""
 
-MOST_ROUNDS: Final = 80
-STALLED_ROUNDS: Final = 12
-"""A hand that comes no nearer in so many rounds will not arrive."""
-_DAMPING = 0.03
-_TILT_WEIGHT_M = 0.15
-_LARGEST_STEP_RAD = 0.25
-_DOWN = np.array([0.0, 0.0, -1.0])
-_LOWER = np.array([joint.lower_rad for joint in JOINTS])
-_UPPER = np.array([joint.upper_rad for joint in JOINTS])
+LEAST_HOVER_M: Final = 0.03
+"""Grippers on their way to and from the cloth stay so far above the table."""
+
+MOST_DETOUR_M: Final = 0.01
+"""Fingers may be so far off the way between two points of it; more is a jump of the joints."""
+
+HANDS_APART_M: Final = 0.045
+"""Fingers are two rods of 3.2 cm."""
+
+SHORTEST_SECS: Final = 0.001
+"""Time between two rows of a plan, also where nothing moves."""
+
+CHEST_BEGINS_RAD: Final = (0.0, 0.5, -0.5, 1.0, -1.0)
+"""Where the search begins; the angles nearest to straight ahead come first."""
 
 
 class Obstacle(StrEnum):
@@ -50,7 +64,7 @@ class Obstacle(StrEnum):
     """No joint angles put the fingers there."""
 
     JOINT_LIMIT = "joint_limit"
-    """Only angles beyond a joint's limits do."""
+    """Only angles beyond a joint's limits do, or a jump from one solution to another."""
 
     SELF_COLLISION = "self_collision"
     """An arm would touch the body or the other arm."""
@@ -78,186 +92,166 @@ class UnreachableError(Exception):
         self.obstacle = obstacle
 
 
-@dataclass(frozen=True, eq=False)
-class MotionPlan:
-    """The joints' way for a gesture."""
-
-    joints_rad: NDArray[np.float64]
-    """f64[K, 15], in the order of `model.JOINTS`."""
-
-    times_secs: NDArray[np.float64]
-    """f64[K], from 0 on; no joint is faster than it may be."""
-
-    closes_at: int
-    """The row in which the grippers close."""
-
-    opens_at: int
-    """The row in which they open."""
-
-    arms: tuple[Arm, ...]
-    """Which arm is which hand of the gesture."""
-
-
 class ArmPlanner:
-    """Plans for one robot; it moves the body that it is given while it thinks."""
+    """Plans for a robot that stands somewhere; equal questions get equal plans."""
 
-    def __init__(self, body: RobotBody, table_id: int | None = None) -> None:
+    def __init__(self, stance: Stance) -> None:
         """Prepare to plan.
 
         Args:
-            body: of the robot, in a physics client of the planner's own.
-            table_id: PyBullet's of the table there, or None to let arms pass through it.
+            stance: where the robot stands; the table is as large as its world.
         """
-        self._body = body
-        self._table_id = table_id
+        self.stance = stance
 
-    def plan(
-        self, starts_in_world: NDArray[np.float64], gesture: Gesture, step_m: float = STEP_M
-    ) -> MotionPlan:
-        """The joints' way from the initial pose to the cloth, through the gesture, and up again.
+    def plan(self, vertices_in_world: NDArray[np.float64], gesture: Gesture) -> MotionPlan:
+        """The joints' way to cloth that lies so, through the gesture, and back.
 
         Args:
-            starts_in_world: f64[H, 3], where each hand closes, metres.
-            gesture: what the hands do; its turns are passed over.
-            step_m: longest way between two solutions; infinite looks at the stations alone, which
-                is quicker and may overlook something between them.
+            vertices_in_world: f64[V, 3], metres; hands close where their first vertex is.
+            gesture: what the hands do.
 
         Raises:
-            UnreachableError: neither assignment of arms to hands does.
+            UnreachableError: no arm for any hand, and no turn of the chest, does.
         """
-        n_hands = len(gesture.hands)
-        if n_hands > len(ARMS):
-            raise UnreachableError(Obstacle.TOO_MANY_HANDS, f"{n_hands} hands for two arms")
-        points, closes_at, opens_at = _way(starts_in_world, gesture, step_m)
-        _check_apart(points)
+        if len(gesture.hands) > len(ARMS):
+            raise UnreachableError(
+                Obstacle.TOO_MANY_HANDS, f"{len(gesture.hands)} hands for two arms"
+            )
+        starts = np.stack([vertices_in_world[hand.grasped[0]] for hand in gesture.hands])
+        way, closes_at, opens_at = _way(starts, gesture)
+        _check_apart(way)
+        points = self.stance.in_robot(way[..., :3])
         refusal: UnreachableError | None = None
-        for arms in _assignments(starts_in_world):
+        for chest_rad, arms in product(CHEST_BEGINS_RAD, _assignments(points[0])):
             try:
-                joints = self._joints(points, arms)
+                joints = self._joints(points, arms, chest_rad)
             except UnreachableError as error:
-                refusal = refusal or error  # the natural assignment's reason is the telling one
+                refusal = refusal or error  # that of the natural way is the telling one
             else:
-                return MotionPlan(joints, _times_secs(joints), closes_at + 1, opens_at + 1, arms)
+                turns = np.concatenate([way[:1, :, 3], way[..., 3], way[-1:, :, 3]])
+                return MotionPlan(
+                    joints, _times_secs(joints), turns, closes_at + 1, opens_at + 1, arms,
+                    self.stance,
+                )  # fmt: skip
         assert refusal is not None
         raise refusal
 
-    def reaches(self, point_in_world: Sequence[float]) -> Obstacle | None:
-        """Why no arm can hold its fingers at a point, metres; None where one can."""
-        points = np.array(point_in_world, dtype=np.float64)[None, None]
-        refusal: Obstacle | None = None
-        for arms in _assignments(points[0]):
-            try:
-                self._joints(points, arms)
-            except UnreachableError as error:
-                refusal = refusal or error.obstacle
-            else:
-                return None
-        return refusal
+    def obstacle(self, vertices_in_world: NDArray[np.float64], gesture: Gesture) -> Obstacle | None:
+        """Why there is no such plan; None where there is one."""
+        try:
+            self.plan(vertices_in_world, gesture)
+        except UnreachableError as error:
+            return error.obstacle
+        return None
 
-    def _joints(self, points: NDArray[np.float64], arms: tuple[Arm, ...]) -> NDArray[np.float64]:
-        """f64[K + 1, 15] for points f64[K, H, 3], from the initial pose on."""
-        rows = [np.array(INITIAL_POSE_RAD)]
-        self._body.pose(rows[0])
+    def _joints(
+        self, points: NDArray[np.float64], arms: tuple[Arm, ...], chest_rad: float
+    ) -> NDArray[np.float64]:
+        """f64[K + 2, 15] for points f64[K, H, 3], from withdrawn to withdrawn."""
+        joints = np.array(WITHDRAWN_POSE_RAD)
+        joints[CHEST_JOINT] = chest_rad
+        for arm in arms:
+            joints[arm_joints(arm)] = np.array(INITIAL_POSE_RAD)[arm_joints(arm)]
+        rows = [np.array(WITHDRAWN_POSE_RAD)]
         for hands in points:
-            for arm, point in zip(arms, hands, strict=True):
-                self._solve(arm, point)
-            rows.append(self._body.joints_rad.copy())
-        return np.stack(rows)
+            solution = solve(joints, arms, hands)
+            if solution is not Solution.FOUND:
+                self._refuse(_OBSTACLES[solution], arms, hands)
+            rows.append(joints.copy())
+        way = np.stack([*rows, rows[0]])
+        self._check_clearances(way, arms, points)
+        self._check_hovers(way[[0, 1]], arms, points[0])
+        self._check_hovers(way[[-2, -1]], arms, points[-1])
+        self._check_detours(way[1:-1], arms, points)
+        return way
 
-    def _solve(self, arm: Arm, point: NDArray[np.float64]) -> None:
-        """Pose the arm so that its fingers are at a point, point down, and touch nothing.
+    def _check_clearances(
+        self, way: NDArray[np.float64], arms: tuple[Arm, ...], points: NDArray[np.float64]
+    ) -> None:
+        table_m = -self.stance.z_m
+        own_m, above_table_m = least_clearances_m(dense(way, CHECK_RAD), table_m)
+        if min(own_m, above_table_m) >= LEAST_CLEARANCE_M:
+            return
+        what = Obstacle.SELF_COLLISION if own_m < LEAST_CLEARANCE_M else Obstacle.TABLE
+        for index, leg in enumerate(pairwise(way)):
+            if (
+                min(least_clearances_m(dense(np.stack(leg), CHECK_RAD), table_m))
+                < LEAST_CLEARANCE_M
+            ):
+                self._refuse(what, arms, points[min(index, len(points) - 1)])
 
-        Position and direction leave the arm no choice but how its hand is spun, so that there is
-        no other solution to look for.
-        """
-        obstacle: Obstacle | None
-        if self._converges(arm, point, within_limits=True):
-            obstacle = self._touches(arm)
-        elif self._converges(arm, point, within_limits=False):
-            obstacle = Obstacle.JOINT_LIMIT
-        else:
-            obstacle = Obstacle.OUT_OF_REACH
-        if obstacle is not None:
-            place = ", ".join(f"{metres:.3f}" for metres in point)
-            raise UnreachableError(obstacle, f"the {arm} hand at ({place}) m")
+    def _check_hovers(
+        self, leg: NDArray[np.float64], arms: tuple[Arm, ...], hands: NDArray[np.float64]
+    ) -> None:
+        heights_m = [
+            fingertips_in_robot(dense(leg, CHECK_RAD), arm)[:, 2] + self.stance.z_m for arm in ARMS
+        ]
+        if np.min(heights_m) < LEAST_HOVER_M:
+            self._refuse(Obstacle.TABLE, arms, hands)
 
-    def _touches(self, arm: Arm) -> Obstacle | None:
-        if self._body.self_distance_m(arm) < LEAST_CLEARANCE_M:
-            return Obstacle.SELF_COLLISION
-        if self._table_id is None:
-            return None
-        is_near = self._body.distance_m(self._table_id, arm) < LEAST_CLEARANCE_M
-        return Obstacle.TABLE if is_near else None
+    def _check_detours(
+        self, way: NDArray[np.float64], arms: tuple[Arm, ...], points: NDArray[np.float64]
+    ) -> None:
+        halfway = (way[1:] + way[:-1]) / 2
+        for arm in arms:
+            tips, between = fingertips_in_robot(way, arm), fingertips_in_robot(halfway, arm)
+            detours_m = np.linalg.norm(between - (tips[1:] + tips[:-1]) / 2, axis=1)
+            if detours_m.max() > MOST_DETOUR_M:
+                self._refuse(Obstacle.JOINT_LIMIT, arms, points[int(detours_m.argmax())])
 
-    def _converges(self, arm: Arm, point: NDArray[np.float64], *, within_limits: bool) -> bool:
-        body, own = self._body, arm_joints(arm)
-        begin, joints = body.joints_rad.copy(), body.joints_rad.copy()
-        errors_m: list[float] = []
-        for _ in range(MOST_ROUNDS):
-            fingers = body.fingers(arm)
-            error_m = point - fingers.position_in_world
-            tilt = np.cross(fingers.direction_in_world, _DOWN)
-            is_down = fingers.direction_in_world @ _DOWN > np.cos(MOST_TILT_RAD)
-            if np.linalg.norm(error_m) < POSITION_TOLERANCE_M and is_down:
-                return True
-            errors_m.append(float(np.linalg.norm(error_m)))
-            if len(errors_m) > STALLED_ROUNDS and errors_m[-1] > 0.95 * errors_m[-STALLED_ROUNDS]:
-                break
-            wanted = np.concatenate([error_m, _TILT_WEIGHT_M * tilt])
-            jacobian = fingers.jacobian * np.array([1.0] * 3 + [_TILT_WEIGHT_M] * 3)[:, None]
-            damped = jacobian @ jacobian.T + _DAMPING**2 * np.eye(6)
-            step = jacobian.T @ np.linalg.solve(damped, wanted)
-            step *= min(1.0, _LARGEST_STEP_RAD / (np.abs(step).max() + 1e-12))
-            joints[own] += step
-            if within_limits:
-                joints[own] = np.clip(joints[own], _LOWER[own], _UPPER[own])
-            body.pose(joints)
-        body.pose(begin)
-        return False
+    def _refuse(
+        self, obstacle: Obstacle, arms: tuple[Arm, ...], points: NDArray[np.float64]
+    ) -> NoReturn:
+        places = [
+            f"the {arm} hand at ({', '.join(f'{metres:.3f}' for metres in place)}) m"
+            for arm, place in zip(arms, self.stance.in_world(points).tolist(), strict=True)
+        ]
+        raise UnreachableError(obstacle, " and ".join(places))
+
+
+_OBSTACLES: Final = {
+    Solution.BEYOND_LIMITS: Obstacle.JOINT_LIMIT,
+    Solution.NONE: Obstacle.OUT_OF_REACH,
+}
 
 
 def _way(
-    starts_in_world: NDArray[np.float64], gesture: Gesture, step_m: float
+    starts_in_world: NDArray[np.float64], gesture: Gesture
 ) -> tuple[NDArray[np.float64], int, int]:
-    """Points f64[K, H, 3] from above the cloth to above it again; where hands close and open."""
-    above = np.array([0.0, 0.0, ABOVE_M])
-    stations = [hand.stations_in_world for hand in gesture.hands]
-    corners = [starts_in_world + above, starts_in_world]
-    corners += [np.stack(row) for row in zip(*stations, strict=True)]
+    """Points and turns f64[K, H, 4] from above the cloth to above it; where hands close, open."""
+    above = np.array([0.0, 0.0, ABOVE_M, 0.0])
+    starts = np.concatenate([starts_in_world, np.zeros((len(starts_in_world), 1))], axis=1)
+    stations = [hand.stations_and_turns() for hand in gesture.hands]
+    corners = [starts + above, starts, *(np.stack(row) for row in zip(*stations, strict=True))]
     corners.append(corners[-1] + above)
     rows, ends = [corners[0][None]], [0]
     for a, b in pairwise(corners):
-        n_steps = max(1, int(np.ceil(np.linalg.norm(b - a, axis=1).max() / step_m)))
+        longest_m = np.linalg.norm((b - a)[:, :3], axis=1).max()
+        n_steps = max(1, int(np.ceil(longest_m / STEP_M)))
         portion = np.arange(1, n_steps + 1) / n_steps
         rows.append(a + portion[:, None, None] * (b - a))
         ends.append(ends[-1] + n_steps)
     return np.concatenate(rows), ends[1], ends[-2]
 
 
-def _check_apart(points: NDArray[np.float64]) -> None:
-    if points.shape[1] < 2:
+def _check_apart(way: NDArray[np.float64]) -> None:
+    if way.shape[1] < 2:
         return
-    nearest_m = float(np.linalg.norm(points[:, 0] - points[:, 1], axis=1).min())
+    nearest_m = float(np.linalg.norm((way[:, 0] - way[:, 1])[:, :3], axis=1).min())
     if nearest_m < HANDS_APART_M:
         raise UnreachableError(Obstacle.HANDS_TOO_CLOSE, f"hands {nearest_m:.3f} m apart")
 
 
-def _assignments(starts_in_world: NDArray[np.float64]) -> list[tuple[Arm, ...]]:
-    """Arms for hands, the natural one first: the left arm for what lies more to the left."""
-    x_m = starts_in_world[:, 0]
-    if len(x_m) == 1:
-        return [("left",), ("right",)] if x_m[0] < 0 else [("right",), ("left",)]
-    return (
-        [("left", "right"), ("right", "left")]
-        if x_m[0] < x_m[1]
-        else [
-            ("right", "left"),
-            ("left", "right"),
-        ]
-    )
+def _assignments(starts_in_robot: NDArray[np.float64]) -> list[tuple[Arm, ...]]:
+    """Arms for hands, the natural one first: the left arm for what lies more to its left."""
+    lefts_m = starts_in_robot[:, 1]
+    if len(lefts_m) == 1:
+        return [("left",), ("right",)] if lefts_m[0] > 0 else [("right",), ("left",)]
+    both: list[tuple[Arm, ...]] = [("left", "right"), ("right", "left")]
+    return both if lefts_m[0] > lefts_m[1] else both[::-1]
 
 
-def _times_secs(joints_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def _times_secs(way: NDArray[np.float64]) -> NDArray[np.float64]:
     """When each row is reached if the fastest joint of each step moves at its limit."""
-    steps = np.abs(np.diff(joints_rad, axis=0)).max(axis=1) / SPEED_RAD_PER_S
+    steps = np.maximum(np.abs(np.diff(way, axis=0)).max(axis=1) / SPEED_RAD_PER_S, SHORTEST_SECS)
     return np.concatenate([[0.0], np.cumsum(steps)])

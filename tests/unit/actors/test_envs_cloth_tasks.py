@@ -1,5 +1,6 @@
 """What every cloth task must do, and the folding tasks one by one."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -182,7 +183,7 @@ def test_size_noise_and_luck_change_what_they_name() -> None:
     assert 1 <= stayed <= 9
 
 
-def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
+def test_the_robot_can_make_every_flip() -> None:
     env = make("HandkerchiefFlip36", robot=True)
     picture, info = env.reset(seed=0)
     assert info["action_mask"].all()
@@ -190,16 +191,64 @@ def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
     assert info["unreachable"] is None
     assert (moved != picture).any()
     env.close()
-    far = make("HandkerchiefFold", robot=True)
-    picture, info = far.reset(seed=0)
-    mask = info["action_mask"]
-    assert mask.shape == (3,)
-    assert 0 < mask.sum() < 3
-    assert far.action_space.sample(mask) in np.flatnonzero(mask)
-    after, _, _, _, info = far.step(int(mask.argmin()))
-    assert info["unreachable"] in {"out_of_reach", "joint_limit", "self_collision"}
-    np.testing.assert_array_equal(after, picture)
-    far.close()
+
+
+def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
+    """Standing where two hands in one line before it are in each other's way."""
+    env = make("HandkerchiefFold", robot=True, robot_stance="front", horizon=6)
+    picture, info = env.reset(seed=0)
+    n_refused = 0
+    for action in (1, 2, 0, 1, 2):
+        mask, before = info["action_mask"], picture
+        assert mask.shape == (3,)
+        picture, _, _, _, info = env.step(action)
+        assert (info["unreachable"] is None) == bool(mask[action])
+        if info["unreachable"] is not None:
+            n_refused += 1
+            assert info["unreachable"] in {"out_of_reach", "joint_limit", "self_collision"}
+            np.testing.assert_array_equal(picture, before)
+    assert 0 < n_refused < 5
+    assert env.action_space.sample(info["action_mask"]) in np.flatnonzero(info["action_mask"])
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["ShirtFold", "TrousersFold", "HandkerchiefFold"])
+def test_the_robot_can_make_the_scripted_folds_and_they_succeed(env_id: str) -> None:
+    env = make(env_id, robot=True)
+    env.reset(seed=1)
+    for action in env.task.script:  # type: ignore[attr-defined]
+        _, _, _, _, info = env.step(action)
+        assert info["unreachable"] is None
+    assert info["success"]
+    env.close()
+
+
+@pytest.mark.parametrize("engine", ["xpbd", "pybullet"])
+def test_gymnasium_s_checker_passes_with_the_robot(engine: str) -> None:
+    options = {"engine": engine, "sizes": {"side_m": 0.16}, "spacing_m": 0.04, "robot": True}
+    env = make_env("clothbus/HandkerchiefFold-v0", render_mode="rgb_array", **options)
+    check_env(env)
+    env.close()
+
+
+def test_a_filmed_robot_changes_nothing_and_is_seen_to_move() -> None:
+    env, unseen = (
+        make("HandkerchiefFold", robot=True, render_px=64),
+        make("HandkerchiefFold", robot=True, render_px=64),
+    )
+    env.film_every_secs = 0.5
+    for each in (env, unseen):
+        each.reset(seed=0)
+        assert each.robot_film() == []
+    one, two = env.step(0), unseen.step(0)
+    np.testing.assert_array_equal(one[0], two[0])
+    assert unseen.robot_film() == []
+    film = env.robot_film()
+    assert len(film) > 10
+    assert {picture.shape for picture in film} == {(64, 64, 3)}
+    assert all((a != b).any() for a, b in pairwise(film))
+    env.close()
+    unseen.close()
 
 
 @pytest.mark.parametrize("env_id", ["ShirtFold", "TShirtFold"])

@@ -5,10 +5,13 @@ import pytest
 from PIL import Image
 
 from actors.acting import UniformlyRandom
+from actors.robot.planning import Obstacle
 from broker_config.errors import PresetError
 from deploy import task_check
+from deploy.reach_check import check_reach, portion
 from deploy.task_check import check_task
-from deploy.task_commands import task, watch
+from deploy.task_commands import reach, task, watch
+from deploy.watch import watch as write_episode
 
 
 def test_a_good_task_s_expert_succeeds_and_chance_does_not() -> None:
@@ -51,6 +54,33 @@ def test_an_episode_becomes_a_moving_picture(suffix: str, tmp_path: Path) -> Non
             first = np.asarray(picture.convert("RGB"))
             picture.seek(4)
             assert (np.asarray(picture.convert("RGB")) != first).any()
+
+
+def test_a_robot_s_episode_shows_its_arms_as_fast_as_they_move(tmp_path: Path) -> None:
+    output = tmp_path / "fold.gif"
+    episode = write_episode(
+        "clothbus/HandkerchiefFold-v0", "scripted", {"robot": True, "render_px": 64}, 0, output
+    )
+    assert (episode.n_actions, episode.frame_secs) == (2, 0.2)
+    assert len(episode.frames) > 50
+    assert output.stat().st_size > 10_000
+
+
+def test_reach_counts_every_action_and_the_script_s(capsys: pytest.CaptureFixture[str]) -> None:
+    options = {"robot_stance": "front"}
+    check = check_reach("clothbus/HandkerchiefFold-v0", options, episodes=2)
+    assert check.all_actions.total() == 2 * 2 * 3
+    assert check.scripted.total() == 2 * 2
+    assert 0.0 < portion(check.all_actions, None) < 1.0
+    assert check.all_actions[Obstacle.SELF_COLLISION] > 0
+    reach("HandkerchiefFold", episodes=1)
+    assert "reachable" in capsys.readouterr().out
+    with pytest.raises(PresetError, match="expected a task with cloth for the robot"):
+        reach("Reaching")
+    with pytest.raises(PresetError, match="--episodes: expected at least 1; got 0"):
+        reach("ShirtFold", episodes=0)
+    with pytest.raises(PresetError, match="robot_stance: expected one of"):
+        reach("ShirtFold", options=("robot_stance=roof",))
 
 
 def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
