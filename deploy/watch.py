@@ -70,7 +70,7 @@ def watch(
         )
     env = make_env(env_id, **{"render_mode": "rgb_array", "render_px": SIZE_PX, **options})
     try:
-        episode = _played(env, _policy(who, env), seed)
+        episode = played(env, _policy(who, env), seed)
     finally:
         env.close()
     _write(episode, output)
@@ -104,7 +104,8 @@ def _learned(folder: RunFolder, env: ClothbusEnv, n_actions: int) -> Policy:
     return Policy.from_bytes(preset.network, weights)
 
 
-def _played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:
+def played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:
+    """An episode as it is seen, by an environment with a render mode."""
     frame_secs = _frame_secs(env)
     stands = round(FRAME_SECS / frame_secs)
     random = np.random.default_rng([seed, 2])
