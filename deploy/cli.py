@@ -396,6 +396,7 @@ def collect(
 app.command(name="task")(task_commands.task)
 app.command(name="reach")(task_commands.reach)
 app.command(name="watch")(task_commands.watch)
+app.command(name="spread")(task_commands.spread)
 
 
 def _require_evaluable(episodes: int, in_process: bool) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from rich.table import Table
@@ -27,6 +27,9 @@ MOST_CHANCE: Final = 0.10
 
 Among two or three actions of a few, chance may well name the right ones.
 """
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 Player = Literal["expert", "chance"]
 PLAYERS: Final[tuple[Player, ...]] = ("expert", "chance")
@@ -105,7 +108,7 @@ def check_task(env_id: str, options: Mapping[str, Any], episodes: int, jobs: int
     ]
     by_player: dict[Player, list[PlayedEpisode]] = {player: [] for player in PLAYERS}
     play = partial(_play, env_id, dict(options))
-    for (player, _), played in zip(chunks, _mapped(play, chunks, jobs), strict=True):
+    for (player, _), played in zip(chunks, mapped(play, chunks, jobs), strict=True):
         by_player[player] += played
     return TaskCheck(env_id, dict(options), by_player)
 
@@ -114,9 +117,8 @@ Chunk = tuple[Player, list[int]]
 """Who plays episodes of which numbers, in one environment."""
 
 
-def _mapped(
-    play: Callable[[Chunk], list[PlayedEpisode]], chunks: list[Chunk], jobs: int
-) -> Iterator[list[PlayedEpisode]]:
+def mapped(play: Callable[[T], R], chunks: list[T], jobs: int) -> Iterator[R]:
+    """What `play` makes of each chunk, in order, with so many processes."""
     if jobs == 1:
         yield from map(play, chunks)
         return

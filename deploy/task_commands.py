@@ -1,11 +1,11 @@
-"""The commands that look at a task alone, without bus or learner: `task`, `reach` and `watch`."""
+"""The commands that look at a task alone: `task`, `reach`, `watch`, `spread`."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -100,6 +100,57 @@ def watch(
         f"{'success' if episode.success else 'no success'} at the end",
         highlight=False,
     )
+
+
+def spread(
+    env_id: Annotated[str, tyro.conf.Positional] = "HandkerchiefFlip36",
+    /,
+    episodes: int = 100,
+    jobs: int = 1,
+    size_px: int = 84,
+    states: tuple[str, ...] = ("crumpled", "random", "creased", "folded_over"),
+    up: Literal["green", "red", "either"] = "either",
+    first_seed: int = 1000,
+    film_strip: Path | None = None,
+    options: Options = (),
+) -> None:
+    """Test the automatic reset: nine in ten handkerchiefs must lie spread again.
+
+    Args:
+        env_id: A task with a handkerchief.
+        episodes: Of each state.
+        jobs: Processes.
+        size_px: Width of the pictures that the rule sees.
+        states: In which the handkerchief lies at first.
+        up: The side that must be up in the end.
+        first_seed: Of the episodes; the rule's numbers were chosen on seeds below 300.
+        film_strip: A .png for the first episode of the first state; it is replaced.
+        options: Arguments of the environment, such as engine="pybullet".
+    """
+    from deploy.spread_check import Trial, check_spreading, draw_film_strip
+
+    numbers = (
+        ("episodes", episodes, 1),
+        ("jobs", jobs, 1),
+        ("size-px", size_px, 32),
+        ("first-seed", first_seed, 0),
+    )
+    for option, value, least in numbers:
+        if value < least:
+            raise PresetError(f"--{option}: expected at least {least}; got {value}")
+    if not states:
+        raise PresetError("--states: expected at least one; got none; leave it out for all")
+    side = None if up == "either" else up
+    trial = Trial(_whole_id(env_id), _parsed(options), size_px, side)
+    try:
+        if film_strip is not None:
+            draw_film_strip(film_strip, trial, states[0])
+        check = check_spreading(trial, states, episodes, jobs, first_seed)
+    except ValueError as error:
+        raise PresetError(str(error)) from error
+    Console().print(check.table())
+    if not check.holds:
+        sys.exit(FAILED_CHECK_EXIT)
 
 
 def _whole_id(env_id: str) -> str:

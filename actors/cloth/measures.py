@@ -10,7 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.cloth.camera import Camera
+from actors.cloth.engine import TABLE_HALF_WIDTH_M
 from actors.cloth.garments import Garment
+from actors.cloth.masks import cloth_mask
+from actors.cloth.rasteriser import draw_cloth
+
+FAR_ABOVE = Camera(size_px=600, view_half_width_m=TABLE_HALF_WIDTH_M, height_m=20.0)
+"""Sees the table from where heights do not matter; 2 mm to a pixel."""
 
 TURN_STEPS = 72
 """Turns of a mask that are tried, and then four times finer ones around the best."""
@@ -32,6 +39,18 @@ def normalised_coverage(mask: NDArray[np.bool_], flat_px: int) -> float:
             f"flat_px: expected the pixels of the flat garment; got {flat_px}; draw it first"
         )
     return float(mask.sum()) / flat_px
+
+
+def true_coverage(vertices_in_world: NDArray[np.float64], garment: Garment) -> float:
+    """Normalised coverage of a simulator's vertices, f64[V, 3], as from far above.
+
+    It sees the whole table, however little of it a task's camera shows.
+    """
+    faces = garment.mesh.faces
+    flat = cloth_mask(draw_cloth(garment.mesh.vertices_m, faces, FAR_ABOVE))
+    return normalised_coverage(
+        cloth_mask(draw_cloth(vertices_in_world, faces, FAR_ABOVE)), int(flat.sum())
+    )
 
 
 def normalised_performance(value: float, at_start: float, at_best: float) -> float:

@@ -43,6 +43,10 @@ class ClothTaskOptions:
     initial_state: InitialState = "flat"
     """See `actors.envs.initial_states`; `reset(options={"initial_state": ...})` overrules it."""
 
+    automatic_reset: bool = False
+    """Begin an episode by spreading the handkerchief that lies there; see
+    `actors.envs.automatic_reset`."""
+
     start_shift_m: float = 0.0
     """The garment begins at most this far from its place, along x and along y."""
 

@@ -25,17 +25,25 @@ from actors.cloth.grasps import grasped_vertices
 from actors.cloth.guard import GuardReason
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Paint
+from actors.cloth.spreading import OnPull, Spread, SpreadAim, SpreadEnd
 from actors.envs.arguments import checked_action
+from actors.envs.automatic_reset import (
+    AIM,
+    PLACED,
+    SceneTable,
+    check_automatic_reset,
+    reset_info,
+    spread_scene,
+    spreading_camera,
+)
 from actors.envs.cloth_options import ClothTaskOptions
+from actors.envs.disturbing import disturb
 from actors.envs.episode_clock import EpisodeClock
 from actors.envs.initial_states import (
-    CREASES,
     RANDOM_ACTIONS,
     InitialState,
     Pose,
     check_initial_state,
-    crease,
-    fold_over,
     initial_pose,
 )
 from actors.envs.randomisation import Conditions, make_randomisation
@@ -110,6 +118,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             ValueError: an option is out of the rule.
             OSError: the garment's file cannot be read.
         """
+        if options.automatic_reset:
+            check_automatic_reset(kind)
         self.options = options
         self.render_mode = options.render_mode
         self._kind: GarmentKind = kind
@@ -125,6 +135,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._usual_garment = self._make_garment()
         self._conditions = Conditions()
         self._flat_px = 0
+        self._is_in_order = False
         self._obstacles: tuple[Obstacle | None, ...] = ()
         self.film_every_secs: float | None = None
         """Set it to have each step of the robot filmed; see `robot_film`."""
@@ -221,12 +232,13 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._film = None
         name = (options or {}).get("initial_state", self.options.initial_state)
         check_initial_state(name)
+        outcome = self._try_spread(name)
+        if outcome is not None and self._is_in_order:
+            return self._start(outcome, by_hand=False)
         for _ in range(MOST_START_ATTEMPTS):
             reason = self._try_start(name)
             if reason is None:
-                self._clock.start()
-                _, measures = self._judge()
-                return self._scene.picture.copy(), measures | {"guard": None} | self._mask()
+                return self._start(outcome, by_hand=True)
         raise ClothEngineError(
             f"reset(): expected a sound cloth within {MOST_START_ATTEMPTS} attempts; got "
             f"{reason}; give the engine a shorter time step or the cloth fewer vertices"
@@ -245,12 +257,12 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         index = checked_action(action, self.n_actions)
         planned = self._plan(index)
         self._film = None
-        plan, unreachable = self._plan_arms(planned.gesture)
-        reason = self._perform(planned.gesture, plan) if unreachable is None else None
+        unreachable, reason = self._attempt(planned.gesture)
         truncated = self._clock.tick()
         reward, measures = self._judge()
         if reason is not None:
             self._clock.stop()
+            self._is_in_order = False
             truncated, reward = True, 0.0
             measures |= {"success": False}
         info = measures | planned.info | {"guard": None if reason is None else reason.value}
@@ -258,6 +270,31 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             info |= {"unreachable": None if unreachable is None else unreachable.value}
             info |= self._mask() if reason is None else {}
         return self._scene.picture.copy(), reward, False, truncated, info
+
+    def spread(
+        self,
+        aim: SpreadAim | None = None,
+        size_px: int | None = None,
+        on_pull: OnPull | None = None,
+    ) -> Spread:
+        """Spread the garment by pick and drop, as its picture shows it, outside of any episode.
+
+        Args:
+            aim: when to stop.
+            size_px: width of the pictures for it; by default the observation's, at least 84.
+            on_pull: is told of each pull before it is made.
+
+        Raises:
+            ClothEngineError: before the first reset.
+        """
+        _ = self._scene.garment
+        table = SceneTable(
+            self._scene,
+            spreading_camera(self.camera, size_px),
+            self.np_random,
+            self._attempt,
+        )
+        return spread_scene(table, aim, on_pull)
 
     def render(self) -> NDArray[np.uint8] | None:
         """The scene, u8[render_px, render_px, 3]; None without a render mode.
@@ -286,7 +323,13 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     def close(self) -> None:
         """End the simulator; may be called twice."""
         self._clock.stop()
+        self._is_in_order = False
         self._scene.close()
+
+    def _attempt(self, gesture: Gesture) -> tuple[Obstacle | None, GuardReason | None]:
+        """Make a gesture if the arms can; why not, or why the cloth is not in order afterwards."""
+        plan, obstacle = self._plan_arms(gesture)
+        return obstacle, self._perform(gesture, plan) if obstacle is None else None
 
     def _plan_arms(self, gesture: Gesture) -> tuple[MotionPlan | None, Obstacle | None]:
         """The robot's plan, or what is in its way; neither without a robot."""
@@ -311,6 +354,28 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     def _new_scene(self, settings: Settings) -> Scene:
         stance = None if self._planner is None else self._planner.stance
         return Scene(make_engine(self.options.engine, settings, stance))
+
+    def _start(
+        self, outcome: Spread | None, *, by_hand: bool
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        self._is_in_order = True
+        self._clock.start()
+        _, measures = self._judge()
+        info = measures | {"guard": None} | self._mask()
+        if self.options.automatic_reset:
+            info |= reset_info(outcome, by_hand)
+        return self._scene.picture.copy(), info
+
+    def _try_spread(self, name: InitialState) -> Spread | None:
+        """Begin with the cloth that lies there; None where there is none, or it must be placed."""
+        if not (self.options.automatic_reset and self._is_in_order) or name in PLACED:
+            return None
+        self._is_in_order = False
+        outcome = self.spread(AIM)
+        if outcome.end is SpreadEnd.SPREAD:
+            self._begin()
+            self._is_in_order = self._disturb(name) is None
+        return outcome
 
     def _try_start(self, name: InitialState) -> GuardReason | None:
         random = self.np_random
@@ -347,20 +412,13 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
 
     def _disturb(self, name: InitialState) -> GuardReason | None:
         """What is done to the spread garment before the first observation."""
-        creases = self._conditions.creases + (CREASES if name == "creased" else 0)
-        makers = [crease] * creases + [fold_over] * (name == "folded_over")
-        for make in makers:
-            camera = self._scene.look.camera
-            gesture = make(
-                self._scene.vertices_in_world(), self._scene.mask, camera, self.np_random
-            )
-            if reason := self._scene.perform(gesture):
+        scene, random = self._scene, self.np_random
+        reason = disturb(scene, name, self._conditions.creases, self._flat_px, random)
+        for _ in range(RANDOM_ACTIONS if name == "random" and reason is None else 0):
+            action = int(random.integers(self.n_actions))
+            if reason := scene.perform(self._plan(action).gesture):
                 return reason
-        for _ in range(RANDOM_ACTIONS if name == "random" else 0):
-            action = int(self.np_random.integers(self.n_actions))
-            if reason := self._scene.perform(self._plan(action).gesture):
-                return reason
-        return None
+        return reason
 
     def _perform(self, gesture: Gesture, plan: MotionPlan | None) -> GuardReason | None:
         missed = self._randomisation.missed_grasps

@@ -13,6 +13,7 @@ from actors.cloth.measures import (
     mean_particle_distance_m,
     normalised_coverage,
     normalised_performance,
+    true_coverage,
 )
 from actors.cloth.rasteriser import draw_cloth
 
@@ -47,6 +48,16 @@ def test_coverage_is_an_area_and_a_portion_of_the_flat_one() -> None:
     assert normalised_coverage(mask, flat_px=40) == 0.5
     with pytest.raises(ValueError, match="flat_px: expected the pixels of the flat garment"):
         normalised_coverage(mask, 0)
+
+
+def test_true_coverage_knows_neither_camera_nor_height() -> None:
+    vertices = SQUARE.mesh.vertices_m
+    aside = _moved(vertices, 0.3, 0.35, 0.0)
+    assert true_coverage(aside, SQUARE) == pytest.approx(1.0, abs=0.01)
+    raised = vertices + np.array([0.0, 0.0, 0.1])
+    assert true_coverage(raised, SQUARE) == pytest.approx(1.0, abs=0.02)
+    halved = np.where(vertices[:, :1] > 0.0, vertices * [-1.0, 1.0, 1.0], vertices)
+    assert true_coverage(halved, SQUARE) == pytest.approx(0.5, abs=0.01)
 
 
 def test_performance_is_0_at_the_start_and_1_at_best() -> None:

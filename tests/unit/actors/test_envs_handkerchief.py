@@ -136,7 +136,7 @@ def test_an_action_out_of_range_is_refused(env: HandkerchiefFlipEnv) -> None:
     [
         {"horizon": 0},
         {"engine": "mujoco"},
-        {"initial_state": "crumpled"},
+        {"initial_state": "rolled"},
         {"reward_scale": 0.0},
         {"reward_scale": float("nan")},
         {"randomisation": "some"},
