@@ -28,17 +28,18 @@ class RobotFilm:
     """f64[V, 3], once the cloth had come to rest: shown from opening on."""
 
     def times_secs(self) -> NDArray[np.float64]:
-        """When pictures are taken, f64[N]."""
-        return np.arange(0.0, self.plan.times_secs[-1], self.carried.every_secs)
+        """When pictures are taken, f64[N]: also just when the film's frames were."""
+        every_secs = self.carried.every_secs
+        return np.arange(self.plan.closes_secs % every_secs, self.plan.times_secs[-1], every_secs)
 
     def vertices_at(self, time_secs: float) -> NDArray[np.float64]:
         """Where the cloth is at a time of the plan, f64[V, 3]."""
         if time_secs >= self.plan.opens_secs:
             return self.after
         since_secs = time_secs - self.plan.closes_secs
-        if since_secs < 0.0 or not self.carried.frames:
+        if since_secs < -1e-9 or not self.carried.frames:
             return self.before
-        frame = int(since_secs / self.carried.every_secs)
+        frame = round(since_secs / self.carried.every_secs)
         return self.carried.frames[min(frame, len(self.carried.frames) - 1)]
 
     def picture(
