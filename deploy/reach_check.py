@@ -62,6 +62,7 @@ def check_reach(env_id: str, options: Mapping[str, Any], episodes: int) -> Reach
     env = make_env(env_id, **{**options, **_with_robot(env_id)})
     task = env.unwrapped
     assert isinstance(task, ClothTaskEnv)
+    assert task.arms is not None
     check = ReachCheck(env_id, dict(options))
     expert = scripted_demonstrator(task, task.n_actions, mistake_rate=0.0)
     try:
@@ -71,8 +72,8 @@ def check_reach(env_id: str, options: Mapping[str, Any], episodes: int) -> Reach
             is_over = False
             while not is_over:
                 action = expert.act(picture, random, 0.0)
-                check.all_actions.update(task.obstacles)
-                check.scripted[task.obstacles[action]] += 1
+                check.all_actions.update(task.arms.obstacles)
+                check.scripted[task.arms.obstacles[action]] += 1
                 picture, _, _, is_over, _ = task.step(action)
     finally:
         env.close()

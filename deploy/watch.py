@@ -127,9 +127,9 @@ def played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:
 def _frame_secs(env: ClothbusEnv) -> float:
     """How long to show each picture; a robot is filmed from now on."""
     task = env.unwrapped
-    if not (isinstance(task, ClothTaskEnv) and task.options.robot):
+    if not isinstance(task, ClothTaskEnv) or task.arms is None:
         return FRAME_SECS
-    task.film_every_secs = ROBOT_FRAME_SECS
+    task.arms.film_every_secs = ROBOT_FRAME_SECS
     return ROBOT_FRAME_SECS
 
 

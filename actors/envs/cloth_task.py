@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, SupportsIndex
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.engine import ClothEngineError, Film
+from actors.cloth.engine import ClothEngineError
 from actors.cloth.engines import Settings, make_engine, with_material
 from actors.cloth.garments import (
     Garment,
@@ -20,13 +20,13 @@ from actors.cloth.garments import (
     make_garment,
     usual_spacing_m,
 )
-from actors.cloth.gestures import Gesture, pick_and_drop
-from actors.cloth.grasps import grasped_vertices
+from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, Paint
 from actors.cloth.spreading import OnPull, Spread, SpreadAim, SpreadEnd
 from actors.envs.arguments import checked_action
+from actors.envs.arms import Arms
 from actors.envs.automatic_reset import (
     AIM,
     PLACED,
@@ -46,39 +46,13 @@ from actors.envs.initial_states import (
     check_initial_state,
     initial_pose,
 )
+from actors.envs.planned_actions import PlannedAction
 from actors.envs.randomisation import Conditions, make_randomisation
-from actors.envs.robot_film import RobotFilm
 from actors.envs.scene import Look, Scene
-from actors.robot.motion import MotionPlan
-from actors.robot.planning import ArmPlanner, Obstacle, UnreachableError
+from actors.robot.planning import Obstacle
 from actors.robot.stances import STANCES
 
 MOST_START_ATTEMPTS: Final = 5
-
-
-@dataclass(frozen=True)
-class PlannedAction:
-    """What an action means for the cloth as it lies now."""
-
-    gesture: Gesture
-    info: dict[str, Any] = field(default_factory=dict)
-    """Where hands pick and drop, for `info`: pixels and metres."""
-
-
-def planned_pick_and_drop(
-    vertices_in_world: NDArray[np.float64],
-    camera: Camera,
-    pick_px: NDArray[np.int64],
-    drop_xy_m: tuple[float, float],
-) -> PlannedAction:
-    """Pick cloth that lies so, f64[V, 3], up at a pixel i64[2] (column, row) and drop it."""
-    column, row = pick_px.tolist()
-    pick_xy_m = camera.table_point_m((column + 0.5, row + 0.5))
-    grasped = grasped_vertices(vertices_in_world, pick_xy_m)
-    return PlannedAction(
-        pick_and_drop(vertices_in_world, grasped, drop_xy_m),
-        {"pick_px": (column, row), "drop_xy_m": drop_xy_m},
-    )
 
 
 class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
@@ -130,16 +104,14 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock = EpisodeClock(options.horizon)
         usual = (usual_settings or {}).get(options.engine, {})
         self._engine_settings = {**usual, **(options.engine_settings or {})}
-        self._planner = ArmPlanner(STANCES[options.robot_stance]) if options.robot else None
+        self.arms = Arms(STANCES[options.robot_stance]) if options.robot else None
+        """The robot's; None without a robot."""
+
         self._scene = self._new_scene(self._engine_settings)
         self._usual_garment = self._make_garment()
         self._conditions = Conditions()
         self._flat_px = 0
         self._is_in_order = False
-        self._obstacles: tuple[Obstacle | None, ...] = ()
-        self.film_every_secs: float | None = None
-        """Set it to have each step of the robot filmed; see `robot_film`."""
-        self._film: RobotFilm | None = None
         shape = (options.observation_px, options.observation_px, 3)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Discrete(n_actions)
@@ -190,11 +162,6 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         return self._scene.garment
 
     @property
-    def obstacles(self) -> tuple[Obstacle | None, ...]:
-        """Why the robot cannot do each action as the cloth lies now; empty without a robot."""
-        return self._obstacles
-
-    @property
     def steps_done(self) -> int:
         """Steps made in this episode."""
         return self._clock.steps_done
@@ -229,7 +196,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
                 attempts.
         """
         super().reset(seed=seed, options=options)
-        self._film = None
+        if self.arms is not None:
+            self.arms.draw_back()
         name = (options or {}).get("initial_state", self.options.initial_state)
         check_initial_state(name)
         outcome = self._try_spread(name)
@@ -256,7 +224,6 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._clock.check_running()
         index = checked_action(action, self.n_actions)
         planned = self._plan(index)
-        self._film = None
         unreachable, reason = self._attempt(planned.gesture)
         truncated = self._clock.tick()
         reward, measures = self._judge()
@@ -266,7 +233,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             truncated, reward = True, 0.0
             measures |= {"success": False}
         info = measures | planned.info | {"guard": None if reason is None else reason.value}
-        if self.options.robot:
+        if self.arms is not None:
             info |= {"unreachable": None if unreachable is None else unreachable.value}
             info |= self._mask() if reason is None else {}
         return self._scene.picture.copy(), reward, False, truncated, info
@@ -307,18 +274,10 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         return self._scene.drawn(self._conditions.moved(self._render_camera))
 
     def robot_film(self) -> list[NDArray[np.uint8]]:
-        """The robot in the last step, every `film_every_secs`: u8[render_px, render_px, 3] each.
-
-        Empty where it did not move, was not filmed, or the guard stopped the step.
-        """
-        film, size_px = self._film, self.options.render_px
-        if film is None:
+        """The robot in the last step, u8[render_px, render_px, 3] each; see `Arms.pictures`."""
+        if self.arms is None:
             return []
-        scene = self._scene
-        return [
-            film.picture(time_secs, scene.garment, scene.look, size_px)
-            for time_secs in film.times_secs().tolist()
-        ]
+        return self.arms.pictures(self._scene, self.options.render_px)
 
     def close(self) -> None:
         """End the simulator; may be called twice."""
@@ -328,31 +287,21 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
 
     def _attempt(self, gesture: Gesture) -> tuple[Obstacle | None, GuardReason | None]:
         """Make a gesture if the arms can; why not, or why the cloth is not in order afterwards."""
-        plan, obstacle = self._plan_arms(gesture)
-        return obstacle, self._perform(gesture, plan) if obstacle is None else None
-
-    def _plan_arms(self, gesture: Gesture) -> tuple[MotionPlan | None, Obstacle | None]:
-        """The robot's plan, or what is in its way; neither without a robot."""
-        if self._planner is None:
-            return None, None
-        try:
-            return self._planner.plan(self._scene.vertices_in_world(), gesture), None
-        except UnreachableError as error:
-            return None, error.obstacle
+        missed = self._randomisation.missed_grasps
+        is_missed = missed > 0.0 and self.np_random.random() < missed
+        if self.arms is not None:
+            return self.arms.attempt(self._scene, gesture, is_missed=is_missed)
+        return None, None if is_missed else self._scene.perform(gesture)
 
     def _mask(self) -> dict[str, Any]:
         """Which actions the robot can make, for `info`."""
-        if self._planner is None:
+        if self.arms is None:
             return {}
-        vertices, actions = self._scene.vertices_in_world(), range(self.n_actions)
-        self._obstacles = tuple(
-            self._planner.obstacle(vertices, self._plan(action).gesture) for action in actions
-        )
-        reachable = [obstacle is None for obstacle in self._obstacles]
-        return {"action_mask": np.array(reachable, dtype=np.int8)}
+        gestures = (self._plan(action).gesture for action in range(self.n_actions))
+        return {"action_mask": self.arms.look_ahead(self._scene, gestures)}
 
     def _new_scene(self, settings: Settings) -> Scene:
-        stance = None if self._planner is None else self._planner.stance
+        stance = None if self.arms is None else self.arms.stance
         return Scene(make_engine(self.options.engine, settings, stance))
 
     def _start(
@@ -418,17 +367,6 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             action = int(random.integers(self.n_actions))
             if reason := scene.perform(self._plan(action).gesture):
                 return reason
-        return reason
-
-    def _perform(self, gesture: Gesture, plan: MotionPlan | None) -> GuardReason | None:
-        missed = self._randomisation.missed_grasps
-        film, before = Film(self.film_every_secs or np.inf), self._scene.vertices_in_world()
-        reason = None
-        if not (missed > 0.0 and self.np_random.random() < missed):  # it may close on nothing
-            made = gesture if plan is None else plan.carried(gesture)
-            reason = self._scene.perform(made, film if self.film_every_secs else None)
-        if plan is not None and self.film_every_secs is not None and reason is None:
-            self._film = RobotFilm(plan, before, film, self._scene.vertices_in_world())
         return reason
 
     def _use_material(self) -> None:

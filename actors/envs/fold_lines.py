@@ -14,8 +14,9 @@ from actors.cloth.gestures import Gesture
 from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, draw_cloth
 from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv, PlannedAction
+from actors.envs.cloth_task import ClothTaskEnv
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
+from actors.envs.planned_actions import PlannedAction
 
 
 @dataclass(frozen=True)

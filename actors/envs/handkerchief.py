@@ -6,7 +6,8 @@ from actors.cloth.masks import red_mask
 from actors.cloth.pick_points import PickPoints, contour_pick_points, grid_pick_points
 from actors.envs.arguments import check_range
 from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv, PlannedAction, planned_pick_and_drop
+from actors.envs.cloth_task import ClothTaskEnv
+from actors.envs.planned_actions import PlannedAction, planned_pick_and_drop
 
 DROP_POINTS_M: Final = tuple((x_m, y_m) for y_m in (0.09, -0.09) for x_m in (-0.12, 0.0, 0.12))
 """2 x 3 points of the table, from the picture's top left, row by row. **assumed**"""

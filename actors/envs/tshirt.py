@@ -13,8 +13,9 @@ from actors.cloth.markers import TSHIRT_MARKERS, found_markers, painted
 from actors.cloth.pick_points import extreme_pick_points
 from actors.cloth.rasteriser import ClothColours, Paint, draw_cloth
 from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv, PlannedAction, planned_pick_and_drop
+from actors.envs.cloth_task import ClothTaskEnv
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
+from actors.envs.planned_actions import PlannedAction, planned_pick_and_drop
 from actors.envs.tshirt_reward import RewardForm, TshirtReward
 
 VIEW_HALF_WIDTH_M: Final = 0.32

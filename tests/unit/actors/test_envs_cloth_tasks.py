@@ -236,7 +236,8 @@ def test_a_filmed_robot_changes_nothing_and_is_seen_to_move() -> None:
         make("HandkerchiefFold", robot=True, render_px=64),
         make("HandkerchiefFold", robot=True, render_px=64),
     )
-    env.film_every_secs = 0.5
+    assert env.arms is not None
+    env.arms.film_every_secs = 0.5
     for each in (env, unseen):
         each.reset(seed=0)
         assert each.robot_film() == []
