@@ -42,6 +42,14 @@ class ClothTaskOptions:
     initial_state: InitialState = "flat"
     """See `actors.envs.initial_states`; `reset(options={"initial_state": ...})` overrules it."""
 
+    stored_states: str | None = None
+    """Begin with states of this file, or of this name; see `actors.envs.stored_states`.
+
+    Where the garment lies is then the file's alone: neither the options below nor a randomisation
+    moves it. The seed draws one of those of the chosen initial state;
+    `reset(options={"stored_index": 3})` names one.
+    """
+
     start_shift_m: float = 0.0
     """The garment begins at most this far from its place, along x and along y."""
 
@@ -76,4 +84,9 @@ class ClothTaskOptions:
         check_range("start_turn_rad", self.start_turn_rad, 0.0, np.pi)
         check_initial_state(self.initial_state)
         check_render_mode(self.render_mode)
-        make_randomisation(self.randomisation)
+        randomisation = make_randomisation(self.randomisation)
+        if self.stored_states is not None and randomisation.size > 0.0:
+            raise ValueError(
+                "stored_states: expected a randomisation that leaves the garment's size alone; got "
+                f"size {randomisation.size}; stored cloth has one size, choose another"
+            )

@@ -40,6 +40,7 @@ from actors.envs.initial_states import (
 )
 from actors.envs.randomisation import Conditions, make_randomisation
 from actors.envs.scene import Look, Scene
+from actors.envs.stored_states import StoredStart, stored_states_of
 from actors.robot.planning import STEP_M, Obstacle
 from actors.robot.reach import Reach
 
@@ -81,7 +82,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     `info` holds `success`, `guard` (None or a reason), the task's measures and, after a step, what
     the action was. With `robot` it also holds `action_mask` (i8[n_actions], 1 where the arms can do
     it, as `action_space.sample` wants it) and, after a step, `unreachable` (None or an
-    `actors.robot.planning.Obstacle`): then the cloth was left as it is.
+    `actors.robot.planning.Obstacle`): then the cloth was left as it is. With `stored_states` a
+    reset's holds `initial_state` and `stored_index`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
@@ -105,7 +107,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             usual_settings: by engine, where the task's cloth differs from the engine's.
 
         Raises:
-            ValueError: an option is out of the rule.
+            ValueError: an option is out of the rule, or stored states are not of the garment.
             OSError: the garment's file cannot be read.
         """
         self.options = options
@@ -120,6 +122,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         self._engine_settings = {**usual, **(options.engine_settings or {})}
         self._scene = Scene(make_engine(options.engine, self._engine_settings))
         self._usual_garment = self._make_garment()
+        source = options.stored_states
+        self._stored = None if source is None else stored_states_of(source, self._usual_garment)
         self._conditions = Conditions()
         self._flat_px = 0
         self._reach: Reach | None = None
@@ -199,7 +203,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
 
         Args:
             seed: draws everything that is random, from now on.
-            options: `initial_state`, for this episode instead of the one that was chosen.
+            options: `initial_state`, for this episode instead of the one that was chosen, and
+                `stored_index`, the stored state to begin with instead of one that is drawn.
 
         Raises:
             ValueError: there is no such initial state.
@@ -207,14 +212,18 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
                 attempts.
         """
         super().reset(seed=seed, options=options)
-        name = (options or {}).get("initial_state", self.options.initial_state)
+        given = options or {}
+        name = given.get("initial_state", self.options.initial_state)
         check_initial_state(name)
+        stored = self._stored_start(name, given.get("stored_index"))
         for _ in range(MOST_START_ATTEMPTS):
-            reason = self._try_start(name)
+            reason = self._try_start(name, stored)
             if reason is None:
                 self._clock.start()
                 _, measures = self._judge()
-                return self._scene.picture.copy(), measures | {"guard": None} | self._mask()
+                info = measures | {"guard": None} | self._mask()
+                info |= stored.reset_options if stored else {}
+                return self._scene.picture.copy(), info
         raise ClothEngineError(
             f"reset(): expected a sound cloth within {MOST_START_ATTEMPTS} attempts; got "
             f"{reason}; give the engine a shorter time step or the cloth fewer vertices"
@@ -284,7 +293,17 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         reachable = [self._arms().obstacle(vertices, it, np.inf) is None for it in gestures]
         return {"action_mask": np.array(reachable, dtype=np.int8)}
 
-    def _try_start(self, name: InitialState) -> GuardReason | None:
+    def _stored_start(self, name: InitialState, index: int | None) -> StoredStart | None:
+        if self._stored is not None:
+            return self._stored.start(name, index, self.np_random)
+        if index is not None:
+            raise ValueError(
+                f"stored_index: expected none without stored states; got {index}; choose some by "
+                "the option stored_states"
+            )
+        return None
+
+    def _try_start(self, name: InitialState, stored: StoredStart | None) -> GuardReason | None:
         random = self.np_random
         self._conditions = self._randomisation.draw(random)
         size = self._conditions.size
@@ -299,12 +318,15 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         )
         self._flat_px = int(cloth_mask(look.picture(garment.mesh.vertices_m, garment)).sum())
         self._use_material()
-        vertices = self._start_pose(name).placed(garment.mesh.vertices_m)
-        reason = self._scene.lay(garment, vertices, look, random)
+        if stored is None:
+            vertices = self._start_pose(name).placed(garment.mesh.vertices_m)
+            reason = self._scene.lay(garment, vertices, look, random)
+        else:
+            reason = self._scene.lay(garment, stored.vertices_m, look, random, came_to_rest=True)
         if reason is not None:
             return reason
         self._begin()
-        return self._disturb(name)
+        return self._disturb(name) if stored is None else None
 
     def _start_pose(self, name: InitialState) -> Pose:
         pose = initial_pose(name, self.np_random)

@@ -9,7 +9,8 @@
 | `creased` | spread out but for two creases |
 | `folded_over` | with one end folded over to its middle |
 
-**assumed**: all numbers. Each is drawn from the episode's seed.
+**assumed**: all numbers. Each is drawn from the episode's seed, or taken from a file; see
+`actors.envs.stored_states`.
 """
 
 from dataclasses import dataclass
