@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -44,7 +44,12 @@ class Step:
     guard: str | None
 
 
-def rollout(env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> Iterator[Start | Step]:
+def rollout(
+    env: ClothbusEnv,
+    policy: ActingPolicy,
+    ticket: Ticket,
+    reset_options: Mapping[str, Any] | None = None,
+) -> Iterator[Start | Step]:
     """Plays an episode and yields it as it happens.
 
     Environment and policy are seeded from the ticket alone, so that an episode of a deterministic
@@ -52,7 +57,8 @@ def rollout(env: ClothbusEnv, policy: ActingPolicy, ticket: Ticket) -> Iterator[
     """
     env_seed, policy_seed = np.random.SeedSequence(ticket.seed).spawn(2)
     generator = np.random.default_rng(policy_seed)
-    observation, _ = env.reset(seed=int(env_seed.generate_state(1)[0]))
+    options = None if reset_options is None else dict(reset_options)
+    observation, _ = env.reset(seed=int(env_seed.generate_state(1)[0]), options=options)
     yield Start(observation)
     for _ in range(ticket.steps):
         action = policy.act(observation, generator, ticket.epsilon)
@@ -106,9 +112,10 @@ def collect(
     ticket: Ticket,
     id_: TrajectoryId,
     on_step: Callable[[], None] = lambda: None,
+    reset_options: Mapping[str, Any] | None = None,
 ) -> Trajectory:
     """Plays a whole episode; whatever `on_step` raises after a step ends it."""
-    events = rollout(env, policy, ticket)
+    events = rollout(env, policy, ticket, reset_options)
     start = next(events)
     assert isinstance(start, Start)
     steps: list[Step] = []

@@ -302,31 +302,49 @@ def control(
 def evaluate(
     folder: Annotated[Path, tyro.conf.Positional],
     /,
-    episodes: int = 100,
+    episodes: int | None = None,
     versions: tuple[int, ...] = (),
     mode: Literal["sampled", "greedy"] | None = None,
     jobs: int = 1,
+    stored_states: str | None = None,
+    initial_states: tuple[str, ...] = (),
 ) -> None:
-    """Score policy versions of a run on seeds of their own.
+    """Score policy versions of a run on seeds of their own, or on stored initial states.
 
     Args:
         folder: The run folder.
-        episodes: Episodes for each version.
+        episodes: Episodes for each version, 100 if not given; of stored states, for each initial
+            state, all of them if not given.
         versions: Policy versions; the untrained and the newest if none is given.
         mode: Sample actions from the policy, or take the preferred ones; DQN has the latter only.
         jobs: Processes.
+        stored_states: A file of `clothbus states`, or handkerchief, shirt, trousers, which come
+            with clothbus.
+        initial_states: Which of them; all if none is given.
     """
     from deploy.evaluate import evaluate as evaluate_versions
-    from deploy.evaluate import score_table
+    from deploy.evaluate import evaluate_on_stored_states, score_table, stored_score_table
     from deploy.run_folder import RunFolder
 
-    _require_positive("episodes", episodes)
+    if episodes is not None:
+        _require_positive("episodes", episodes)
     _require_positive("jobs", jobs)
+    if initial_states and stored_states is None:
+        raise PresetError(
+            f"--initial-states: expected none without --stored-states; got "
+            f"{', '.join(initial_states)}; name a file of states"
+        )
     run_folder = RunFolder(folder)
     is_dqn = run_folder.read_preset().algorithm.method == "dqn"
     chosen = mode or ("greedy" if is_dqn else "sampled")
-    scores = evaluate_versions(run_folder, versions, episodes, chosen, jobs)
-    Console().print(score_table(scores))
+    if stored_states is None:
+        table = score_table(evaluate_versions(run_folder, versions, episodes or 100, chosen, jobs))
+    else:
+        by_state = evaluate_on_stored_states(
+            run_folder, versions, stored_states, initial_states, chosen, jobs, episodes
+        )
+        table = stored_score_table(by_state)
+    Console().print(table)
 
 
 @app.command(name="evaluator")
@@ -397,6 +415,7 @@ app.command(name="task")(task_commands.task)
 app.command(name="reach")(task_commands.reach)
 app.command(name="watch")(task_commands.watch)
 app.command(name="spread")(task_commands.spread)
+app.command(name="states")(task_commands.states)
 
 
 def _require_evaluable(episodes: int, in_process: bool) -> None:

@@ -7,7 +7,7 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from actors.acting import Greedy, Sampled
 from actors.cloth.guard import GuardReason
+from actors.envs.stored_states import read_stored_states
 from actors.policy import Policy
 from actors.rollout import collect
 from actors.task import make_task_env
@@ -48,7 +49,7 @@ class Episode:
     version: int
     mode: Mode
     number: int
-    """Names the episode's seed."""
+    """Names the episode's seed, and the stored state where it begins with one."""
     return_: float
     success: bool
 
@@ -99,17 +100,26 @@ class Player:
     """Plays evaluation episodes of a preset's task in an environment of its own.
 
     All versions and modes play the same seeds. An episode that the guard ends is played again on
-    another seed; one whose simulator is lost, on the same.
+    another seed; one whose simulator is lost, on the same. Among stored states there is no other to
+    take: there an episode that the guard ends has failed.
     """
 
-    def __init__(self, preset: Preset) -> None:
+    def __init__(self, preset: Preset, stored_states: str | None = None) -> None:
         """Makes the environment.
 
+        Args:
+            preset: Whose task is played.
+            stored_states: Where given, episode n begins with state n of this file or name.
+
         Raises:
-            PresetError: Task and preset disagree.
+            PresetError: Task and preset disagree, or the states are not of the task's garment.
         """
         self._preset = preset
-        self._env = make_task_env(preset.task)
+        task = preset.task
+        if stored_states is not None:
+            task = replace(task, options={**task.options, "stored_states": stored_states})
+        self._env = make_task_env(task)
+        self._starts = [] if stored_states is None else read_stored_states(stored_states).starts()
 
     def close(self) -> None:
         """Ends the environment."""
@@ -130,7 +140,8 @@ class Player:
         """
         for attempt in range(GUARDED_ATTEMPTS):
             trajectory = self._attempt(policy, version, mode, (number, attempt), on_step)
-            if trajectory.guard is None:
+            is_over = self._starts and trajectory.guard != GuardReason.ENGINE_LOST
+            if trajectory.guard is None or is_over:
                 return Episode(version, mode, number, trajectory.return_, trajectory.success)
         raise StorageError(
             f"evaluation episode {number}: expected a sound attempt with one of "
@@ -150,8 +161,9 @@ class Player:
         ticket = Ticket(number, attempt, 0, seed, version, self._preset.task.horizon, 0.0)
         acting = Greedy(policy) if mode == "greedy" else Sampled(policy)
         id_ = TrajectoryId("evaluation", "evaluation", number)
+        start = self._starts[number].reset_options if self._starts else None
         for _ in range(LOST_SIMULATORS):
-            trajectory = collect(self._env, acting, ticket, id_, on_step)
+            trajectory = collect(self._env, acting, ticket, id_, on_step, start)
             if trajectory.guard != GuardReason.ENGINE_LOST:
                 break
         return trajectory

@@ -79,6 +79,10 @@ class RunFolder:
         """Every episode that an evaluation has played, live or afterwards."""
         return self.path / "evaluation.jsonl"
 
+    def stored_evaluation(self, states_digest: str) -> Path:
+        """Every episode that began with stored states of this digest."""
+        return self.path / f"evaluation-{states_digest[:12]}.jsonl"
+
     @property
     def evaluation_tensorboard(self) -> Path:
         """The evaluator's part of the TensorBoard logs."""

@@ -1,4 +1,4 @@
-"""The commands that look at a task alone: `task`, `reach`, `watch`, `spread`."""
+"""The commands that look at a task alone: `task`, `reach`, `watch`, `spread`, `states`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from broker_config.errors import PresetError
+from broker_config.errors import PresetError, StorageError
 from broker_config.preset import toml_value
 from deploy.process import FAILED_CHECK_EXIT
 
@@ -151,6 +151,42 @@ def spread(
     Console().print(check.table())
     if not check.holds:
         sys.exit(FAILED_CHECK_EXIT)
+
+
+def states(
+    env_id: Annotated[str, tyro.conf.Positional],
+    /,
+    output: Path,
+    names: tuple[str, ...],
+    seeds: int = 10,
+    options: Options = (),
+) -> None:
+    """Store initial states of a task, so that every later evaluation begins with the same cloth.
+
+    Args:
+        env_id: A cloth task's id, such as ShirtFold or clothbus/ShirtFold-v0.
+        output: A file that ends in .npz; it is replaced.
+        names: Of the initial states.
+        seeds: How many of each name, from seeds that count from 0.
+        options: Arguments of the environment, such as difficulty="hard" spacing_m=0.02.
+    """
+    from actors.envs.stored_states import write_stored_states
+    from deploy.make_states import make_states
+
+    if seeds < 1:
+        raise PresetError(f"--seeds: expected at least 1; got {seeds}")
+    try:
+        made = make_states(_whole_id(env_id), _parsed(options), names, seeds)
+        write_stored_states(output, made)
+    except ValueError as error:
+        raise PresetError(str(error)) from error
+    except OSError as error:
+        raise StorageError(f"{output}: {error}; choose a place that can be written") from error
+    Console().print(
+        f"{output}: {len(made.names)} states of {made.garment}, "
+        f"{output.stat().st_size / 1e3:.0f} kB, digest {made.digest[:12]}",
+        highlight=False,
+    )
 
 
 def _whole_id(env_id: str) -> str:

@@ -1,7 +1,7 @@
 """What a cloth engine offers to the tasks, and what can go wrong in one."""
 
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +99,23 @@ class RestorableClothEngine(ClothEngine, Protocol, Generic[StateT]):
 
     def restore(self, state: StateT) -> None:
         """Return to a state that `save` of this engine gave."""
+        ...
+
+
+@runtime_checkable
+class PlaceableClothEngine(Protocol):
+    """An engine that takes vertices over bit by bit, where `ClothEngine.reset` lets them settle."""
+
+    def put(self, mesh: ClothMesh, vertices_in_world: NDArray[np.float64]) -> None:
+        """Put cloth that came to rest earlier on an empty table, just as it lay.
+
+        Args:
+            mesh: the cloth.
+            vertices_in_world: f64[V, 3], metres, as `ClothEngine.vertices_in_world` gave them.
+
+        Raises:
+            ValueError: the vertices do not fit the mesh.
+        """
         ...
 
 

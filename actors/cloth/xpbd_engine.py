@@ -77,6 +77,11 @@ class XpbdEngine:
         self._place(vertices, np.zeros_like(vertices))
         self._settle(least_secs=0.0)
 
+    def put(self, mesh: ClothMesh, vertices_in_world: NDArray[np.float64]) -> None:
+        """Put cloth on the table as it lay; see `PlaceableClothEngine.put`."""
+        vertices = checked_vertices(mesh, vertices_in_world)
+        self.restore(XpbdState(mesh, vertices, np.zeros_like(vertices)))
+
     def vertices_in_world(self) -> NDArray[np.float64]:
         """Where the vertices are, f64[V, 3]: a copy; see `ClothEngine.vertices_in_world`."""
         _ = self.mesh

@@ -47,6 +47,14 @@ class ClothTaskOptions:
     """Begin an episode by spreading the handkerchief that lies there; see
     `actors.envs.automatic_reset`."""
 
+    stored_states: str | None = None
+    """Begin with states of this file, or of this name; see `actors.envs.stored_states`.
+
+    Where the garment lies is then the file's alone: neither the options below nor a randomisation
+    moves it. The seed draws one of those of the chosen initial state;
+    `reset(options={"stored_index": 3})` names one.
+    """
+
     start_shift_m: float = 0.0
     """The garment begins at most this far from its place, along x and along y."""
 
@@ -84,5 +92,15 @@ class ClothTaskOptions:
         check_range("start_turn_rad", self.start_turn_rad, 0.0, np.pi)
         check_initial_state(self.initial_state)
         check_render_mode(self.render_mode)
-        make_randomisation(self.randomisation)
         check_stance(self.robot_stance)
+        randomisation = make_randomisation(self.randomisation)
+        if self.stored_states is not None and randomisation.size > 0.0:
+            raise ValueError(
+                "stored_states: expected a randomisation that leaves the garment's size alone; got "
+                f"size {randomisation.size}; stored cloth has one size, choose another"
+            )
+        if self.stored_states is not None and self.automatic_reset:
+            raise ValueError(
+                "stored_states: expected no automatic_reset; got both; stored cloth must be put "
+                "where it is said to lie, choose one of them"
+            )

@@ -49,6 +49,7 @@ from actors.envs.initial_states import (
 from actors.envs.planned_actions import PlannedAction
 from actors.envs.randomisation import Conditions, make_randomisation
 from actors.envs.scene import Look, Scene
+from actors.envs.stored_states import StoredStart, stored_states_of
 from actors.robot.planning import Obstacle
 from actors.robot.stances import STANCES
 
@@ -65,7 +66,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     `info` holds `success`, `guard` (None or a reason), the task's measures and, after a step, what
     the action was. With `robot` it also holds `action_mask` (i8[n_actions], 1 where the arms can do
     it, as `action_space.sample` wants it) and, after a step, `unreachable` (None or an
-    `actors.robot.planning.Obstacle`): then the cloth was left as it is.
+    `actors.robot.planning.Obstacle`): then the cloth was left as it is. With `stored_states` a
+    reset's holds `initial_state` and `stored_index`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
@@ -89,7 +91,7 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             usual_settings: by engine, where the task's cloth differs from the engine's.
 
         Raises:
-            ValueError: an option is out of the rule.
+            ValueError: an option is out of the rule, or stored states are not of the garment.
             OSError: the garment's file cannot be read.
         """
         if options.automatic_reset:
@@ -109,6 +111,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
 
         self._scene = self._new_scene(self._engine_settings)
         self._usual_garment = self._make_garment()
+        source = options.stored_states
+        self._stored = None if source is None else stored_states_of(source, self._usual_garment)
         self._conditions = Conditions()
         self._flat_px = 0
         self._is_in_order = False
@@ -188,7 +192,8 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
 
         Args:
             seed: draws everything that is random, from now on.
-            options: `initial_state`, for this episode instead of the one that was chosen.
+            options: `initial_state`, for this episode instead of the one that was chosen, and
+                `stored_index`, the stored state to begin with instead of one that is drawn.
 
         Raises:
             ValueError: there is no such initial state.
@@ -198,15 +203,18 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         super().reset(seed=seed, options=options)
         if self.arms is not None:
             self.arms.draw_back()
-        name = (options or {}).get("initial_state", self.options.initial_state)
+        given = options or {}
+        name = given.get("initial_state", self.options.initial_state)
         check_initial_state(name)
+        stored = self._stored_start(name, given.get("stored_index"))
         outcome = self._try_spread(name)
         if outcome is not None and self._is_in_order:
             return self._start(outcome, by_hand=False)
         for _ in range(MOST_START_ATTEMPTS):
-            reason = self._try_start(name)
+            reason = self._try_start(name, stored)
             if reason is None:
-                return self._start(outcome, by_hand=True)
+                observation, info = self._start(outcome, by_hand=True)
+                return observation, info | (stored.reset_options if stored else {})
         raise ClothEngineError(
             f"reset(): expected a sound cloth within {MOST_START_ATTEMPTS} attempts; got "
             f"{reason}; give the engine a shorter time step or the cloth fewer vertices"
@@ -326,7 +334,17 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             self._is_in_order = self._disturb(name) is None
         return outcome
 
-    def _try_start(self, name: InitialState) -> GuardReason | None:
+    def _stored_start(self, name: InitialState, index: int | None) -> StoredStart | None:
+        if self._stored is not None:
+            return self._stored.start(name, index, self.np_random)
+        if index is not None:
+            raise ValueError(
+                f"stored_index: expected none without stored states; got {index}; choose some by "
+                "the option stored_states"
+            )
+        return None
+
+    def _try_start(self, name: InitialState, stored: StoredStart | None) -> GuardReason | None:
         random = self.np_random
         self._conditions = self._randomisation.draw(random)
         size = self._conditions.size
@@ -341,12 +359,15 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
         )
         self._flat_px = int(cloth_mask(look.picture(garment.mesh.vertices_m, garment)).sum())
         self._use_material()
-        vertices = self._start_pose(name).placed(garment.mesh.vertices_m)
-        reason = self._scene.lay(garment, vertices, look, random)
+        if stored is None:
+            vertices = self._start_pose(name).placed(garment.mesh.vertices_m)
+            reason = self._scene.lay(garment, vertices, look, random)
+        else:
+            reason = self._scene.lay(garment, stored.vertices_m, look, random, came_to_rest=True)
         if reason is not None:
             return reason
         self._begin()
-        return self._disturb(name)
+        return self._disturb(name) if stored is None else None
 
     def _start_pose(self, name: InitialState) -> Pose:
         pose = initial_pose(name, self.np_random)

@@ -10,7 +10,8 @@
 | `folded_over` | with one end folded over to its middle |
 | `crumpled` | picked up anywhere and dropped near the middle, 8 to 30 times |
 
-**assumed**: all numbers. Each is drawn from the episode's seed.
+**assumed**: all numbers. Each is drawn from the episode's seed, or taken from a file; see
+`actors.envs.stored_states`.
 """
 
 from dataclasses import dataclass

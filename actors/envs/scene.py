@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.engine import ClothEngine, ClothEngineError, Film
+from actors.cloth.engine import ClothEngine, ClothEngineError, Film, PlaceableClothEngine
 from actors.cloth.garments import Garment
 from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason, guard
@@ -109,6 +109,7 @@ class Scene:
         vertices_in_world: NDArray[np.float64],
         look: Look,
         random: np.random.Generator,
+        came_to_rest: bool = False,
     ) -> GuardReason | None:
         """Put a garment on the empty table and look at it.
 
@@ -117,6 +118,8 @@ class Scene:
             vertices_in_world: f64[V, 3], where its vertices are put, metres.
             look: how it looks from now on.
             random: draws the sensor's noise, if the look has any.
+            came_to_rest: the vertices are of cloth that did so earlier; an engine that can takes
+                them over as they are.
 
         Returns:
             Why the cloth is not in order; None where it is.
@@ -125,7 +128,10 @@ class Scene:
             ClothEngineError: the simulator does not start.
         """
         self._garment, self._look, self._random = garment, look, random
-        self._engine.reset(garment.mesh, vertices_in_world)
+        if came_to_rest and isinstance(self._engine, PlaceableClothEngine):
+            self._engine.put(garment.mesh, vertices_in_world)
+        else:
+            self._engine.reset(garment.mesh, vertices_in_world)
         return self._see()
 
     def perform(self, gesture: Gesture, film: Film | None = None) -> GuardReason | None:

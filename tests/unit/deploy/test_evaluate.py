@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.envs.stored_states import read_stored_states, write_stored_states
 from actors.policy import Policy
 from broker_config.errors import AlreadyOwned, PresetError, StorageError
 from deploy import evaluation
-from deploy.evaluate import evaluate
+from deploy.evaluate import evaluate, evaluate_on_stored_states, stored_score_table
 from deploy.evaluation import (
     Episode,
     Player,
@@ -24,6 +25,7 @@ from deploy.evaluation import (
     scores_of,
 )
 from deploy.evaluator import next_episode
+from deploy.make_states import make_states
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, create_run_folder
 from learner.snapshots import SnapshotStore
@@ -97,6 +99,83 @@ def test_one_process_at_a_time_evaluates_a_run(folder: RunFolder) -> None:
     with Results(folder.evaluation), pytest.raises(AlreadyOwned, match=f"pid {os.getpid()} on"):
         evaluate(folder, (0,), 1, "greedy", jobs=1)
     assert len(evaluate(folder, (0,), 1, "greedy", jobs=1)) == 1
+
+
+# Stored states --------------------------------------------------------------------------------
+
+COARSE = {"spacing_m": 0.05, "start_shift_m": 0.01}
+
+
+@pytest.fixture
+def flipping(tmp_path: Path) -> RunFolder:
+    """An untrained run, and its two versions."""
+    settings = ["task.horizon=2", "task.options.spacing_m=0.05"]
+    preset = load_preset("handkerchief-quickstart", settings)
+    folder = create_run_folder(tmp_path, preset)
+    store = SnapshotStore(folder.snapshots)
+    for version in (0, 3):
+        store.put(version, Trainer(preset).weights_bytes())
+    return folder
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Path:
+    path = tmp_path / "states.npz"
+    made = make_states("clothbus/HandkerchiefFlip36-v0", COARSE, ("flat", "folded_over"), 3)
+    write_stored_states(path, made)
+    return path
+
+
+def test_each_stored_state_is_played_once_and_scored_by_its_name(
+    flipping: RunFolder, stored: Path
+) -> None:
+    def score(names: tuple[str, ...], episodes: int | None = None) -> dict[str, Any]:
+        return evaluate_on_stored_states(flipping, (), str(stored), names, "greedy", 1, episodes)
+
+    by_state = score(())
+    assert list(by_state) == ["flat", "folded_over"]
+    for first, last in by_state.values():
+        assert (first.version, last.version, first.episodes) == (0, 3, 3)
+        assert first.returns == last.returns  # the same weights, here
+    assert stored_score_table(by_state).row_count == 4
+    assert not flipping.evaluation.exists(), "scores from seeds are another matter"
+    results = flipping.stored_evaluation(read_stored_states(str(stored)).digest)
+    before = results.read_bytes()
+    (few, _) = score(("folded_over",), episodes=2)["folded_over"]
+    assert few.returns == by_state["folded_over"][0].returns[:2]
+    assert results.read_bytes() == before, "what was played is not played again"
+
+
+def test_an_episode_from_a_stored_state_that_the_guard_ends_has_failed(
+    flipping: RunFolder, stored: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def collect_guarded(*arguments: Any) -> Any:
+        trajectory = collect(*arguments)
+        object.__setattr__(trajectory, "guard", next(guards))
+        object.__setattr__(trajectory, "success", False)
+        return trajectory
+
+    collect, guards = evaluation.collect, iter(["engine_lost", "overstretched"])
+    monkeypatch.setattr(evaluation, "collect", collect_guarded)
+    preset = flipping.read_preset()
+    policy = Policy(preset.network, Trainer(preset).weights())
+    episode = Player(preset, str(stored)).play(policy, 0, "greedy", 4)
+    assert (episode.number, episode.success) == (4, False)
+    assert next(guards, None) is None
+
+
+def test_stored_states_that_cannot_be_played_are_refused(
+    flipping: RunFolder, folder: RunFolder, stored: Path
+) -> None:
+    def refused(run: RunFolder, source: str, complaint: str, *names: str, many: int = 1) -> None:
+        with pytest.raises(PresetError, match=complaint):
+            evaluate_on_stored_states(run, (0,), source, names, "greedy", 1, many)
+
+    refused(flipping, str(stored), "expected at least 4 flat; got 3; there are flat, fol", many=4)
+    refused(flipping, str(stored), "expected at least 1 creased; got 0", "creased")
+    refused(flipping, "socks", "or one of handkerchief, shirt, trousers; got 'socks'")
+    refused(flipping, "shirt", "expected states of this garment, handkerchief")
+    refused(folder, str(stored), "got stored_states; leave out what this task lacks")
 
 
 # The file -------------------------------------------------------------------------------------

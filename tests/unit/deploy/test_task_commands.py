@@ -5,12 +5,15 @@ import pytest
 from PIL import Image
 
 from actors.acting import UniformlyRandom
+from actors.envs import make_env
+from actors.envs.handkerchief import HandkerchiefFlipEnv
+from actors.envs.stored_states import GRID_M, read_stored_states
 from actors.robot.planning import Obstacle
-from broker_config.errors import PresetError
-from deploy import task_check
+from broker_config.errors import PresetError, StorageError
+from deploy import make_states, task_check
 from deploy.reach_check import check_reach, portion
 from deploy.task_check import check_task
-from deploy.task_commands import reach, task, watch
+from deploy.task_commands import reach, states, task, watch
 from deploy.watch import watch as write_episode
 
 
@@ -92,3 +95,62 @@ def test_what_cannot_be_watched_is_refused(tmp_path: Path) -> None:
         watch("ShirtFold", tmp_path / "fold.gif", options=("hard",))
     with pytest.raises(PresetError, match="--jobs: expected at least 1; got 0"):
         task("ShirtFold", jobs=0)
+
+
+# Initial states -------------------------------------------------------------------------------
+
+COARSE = "spacing_m=0.05"
+
+
+def test_states_are_made_from_their_seeds_and_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output, again = tmp_path / "new" / "states.npz", tmp_path / "again.npz"
+    for path in (output, again):
+        states("HandkerchiefFlip60", path, ("flat", "folded_over"), seeds=2, options=(COARSE,))
+    assert output.read_bytes() == again.read_bytes()
+    assert "4 states of handkerchief" in " ".join(capsys.readouterr().out.split())
+    stored = read_stored_states(str(output))
+    assert stored.names == ("flat", "flat", "folded_over", "folded_over")
+    assert stored.seeds.tolist() == [0, 1, 0, 1]
+    env = make_env(stored.task, spacing_m=0.05).unwrapped
+    assert isinstance(env, HandkerchiefFlipEnv)
+    env.reset(seed=1, options={"initial_state": "folded_over"})
+    assert np.abs(env.vertices_in_world() - stored.vertices_m[3]).max() <= GRID_M / 2
+
+
+def test_a_seed_that_begins_with_the_task_solved_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def reset(self: HandkerchiefFlipEnv, *, seed: int, options: dict[str, str]) -> object:
+        picture, info = really_reset(self, seed=seed, options=options)
+        return picture, info | {"success": seed in solved}
+
+    really_reset, solved = HandkerchiefFlipEnv.reset, {0, 2, 3}
+    monkeypatch.setattr(HandkerchiefFlipEnv, "reset", reset)
+    states("HandkerchiefFlip36", tmp_path / "some.npz", ("flat",), seeds=2, options=(COARSE,))
+    assert read_stored_states(str(tmp_path / "some.npz")).seeds.tolist() == [1, 4]
+    monkeypatch.setattr(make_states, "MOST_SEEDS", 2)
+    with pytest.raises(StorageError, match="expected 2 at which the task is unsolved; got 1 of 4"):
+        states("HandkerchiefFlip36", tmp_path / "few.npz", ("flat",), seeds=2, options=(COARSE,))
+    assert not (tmp_path / "few.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "names", "options", "complaint"),
+    [
+        ("Reaching", ("flat",), (), "expected a task with cloth; got one without"),
+        ("HandkerchiefFlip36", ("wet",), (COARSE,), "initial_state: expected one of .*; got 'wet'"),
+        ("HandkerchiefFlip36", ("flat",), ('randomisation="sim2real"',), "garment's size alone"),
+        ("HandkerchiefFlip36", ("flat",), ("spacing=1.0",), "expected some of the arguments"),
+    ],
+)
+def test_states_that_cannot_be_made_are_refused(
+    env_id: str, names: tuple[str, ...], options: tuple[str, ...], complaint: str, tmp_path: Path
+) -> None:
+    with pytest.raises(PresetError, match=complaint):
+        states(env_id, tmp_path / "states.npz", names, seeds=1, options=options)
+    with pytest.raises(PresetError, match="--seeds: expected at least 1; got 0"):
+        states(env_id, tmp_path / "states.npz", names, seeds=0)
+    with pytest.raises(PresetError, match=r"output: expected a file that ends in \.npz"):
+        states("HandkerchiefFlip36", tmp_path / "states", ("flat",), seeds=1, options=(COARSE,))
