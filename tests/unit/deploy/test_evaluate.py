@@ -12,11 +12,10 @@ import pytest
 
 from actors.policy import Policy
 from broker_config.errors import AlreadyOwned, PresetError, StorageError
-from deploy import evaluation
+from deploy import player
 from deploy.evaluate import evaluate
 from deploy.evaluation import (
     Episode,
-    Player,
     Results,
     bootstrap_interval,
     modes_of,
@@ -24,6 +23,7 @@ from deploy.evaluation import (
     scores_of,
 )
 from deploy.evaluator import next_episode
+from deploy.player import Player
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, create_run_folder
 from learner.snapshots import SnapshotStore
@@ -191,8 +191,8 @@ def test_a_lost_simulator_does_not_change_the_seed(monkeypatch: pytest.MonkeyPat
         object.__setattr__(trajectory, "guard", next(losses, None))
         return trajectory
 
-    collect = evaluation.collect
-    monkeypatch.setattr(evaluation, "collect", collect_with_losses)
+    collect = player.collect
+    monkeypatch.setattr(player, "collect", collect_with_losses)
     assert Player(preset).play(policy, 0, "sampled", 3) == expected
     assert next(losses, None) is None
     losses = iter(["overstretched"])
