@@ -75,7 +75,7 @@ def run(
         zenoh: Zenoh settings, each key/path=value.
     """
     from deploy.presets import load_preset
-    from deploy.run import RunOptions, run_in_process, run_over_bus
+    from deploy.run import RunOptions, run_over_bus
     from deploy.run_folder import RunFolder, create_run_folder
 
     _require_positive("actors", actors)
@@ -102,7 +102,11 @@ def run(
         overrides=zenoh,
         record=record,
     )
-    carry_out = run_in_process if in_process else run_over_bus
+    carry_out = run_over_bus
+    if in_process:
+        from deploy.run_in_process import run_in_process
+
+        carry_out = run_in_process
     if not carry_out(folder, chosen, options, Console()):
         sys.exit(unfinished_exit())
 

@@ -18,7 +18,8 @@ from actors.envs.stored_states import read_stored_states
 from actors.policy import Policy
 from broker_config.errors import PresetError, StorageError
 from broker_config.preset import Preset
-from deploy.evaluation import Episode, Mode, Player, Results, Score, modes_of, score_of
+from deploy.evaluation import Episode, Mode, Results, Score, modes_of, score_of
+from deploy.player import Player
 from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore

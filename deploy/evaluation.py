@@ -1,4 +1,4 @@
-"""Evaluation: how episodes of a policy version are played, kept and turned into a score."""
+"""Evaluation: how episodes of a policy version are kept and turned into a score."""
 
 from __future__ import annotations
 
@@ -6,26 +6,18 @@ import errno
 import json
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from actors.acting import Greedy, Sampled
-from actors.cloth.guard import GuardReason
-from actors.envs.stored_states import read_stored_states
-from actors.policy import Policy
-from actors.rollout import collect
-from actors.task import make_task_env
 from broker_config.closing import Closing
 from broker_config.errors import StorageError
-from broker_config.messages import Ticket, Trajectory, TrajectoryId
 from broker_config.ownership import FileLock
-from broker_config.preset import AlgorithmPreset, Preset
+from broker_config.preset import AlgorithmPreset
 from broker_config.structure import from_plain, to_plain
-from learner.tickets import derive_seed
 
 Mode = Literal["sampled", "greedy"]
 
@@ -33,13 +25,12 @@ EVALUATION_STREAM = 2**31
 """Keeps the seeds of evaluation apart from those of every ticket of the run."""
 
 BOOTSTRAP_SAMPLES = 10_000
-GUARDED_ATTEMPTS = 20
-
-LOST_SIMULATORS = 10
-"""A simulator that dies is not the seed's fault, but one seed must not kill simulators for ever."""
 
 EpisodeKey = tuple[int, Mode, int]
 """Policy version, mode, number."""
+
+WAITING_FOR_OWNER = "waiting for the owner"
+"""The state of an evaluator that nobody gives policies, as its heartbeats say."""
 
 
 @dataclass(frozen=True)
@@ -91,82 +82,6 @@ class Score:
 def modes_of(algorithm: AlgorithmPreset) -> tuple[Mode, ...]:
     """The ways in which a method's policy can act; Q has no softmax policy."""
     return ("greedy",) if algorithm.method == "dqn" else ("sampled", "greedy")
-
-
-# Playing --------------------------------------------------------------------------------------
-
-
-class Player:
-    """Plays evaluation episodes of a preset's task in an environment of its own.
-
-    All versions and modes play the same seeds. An episode that the guard ends is played again on
-    another seed; one whose simulator is lost, on the same. Among stored states there is no other to
-    take: there an episode that the guard ends has failed.
-    """
-
-    def __init__(self, preset: Preset, stored_states: str | None = None) -> None:
-        """Makes the environment.
-
-        Args:
-            preset: Whose task is played.
-            stored_states: Where given, episode n begins with state n of this file or name.
-
-        Raises:
-            PresetError: Task and preset disagree, or the states are not of the task's garment.
-        """
-        self._preset = preset
-        task = preset.task
-        if stored_states is not None:
-            task = replace(task, options={**task.options, "stored_states": stored_states})
-        self._env = make_task_env(task)
-        self._starts = [] if stored_states is None else read_stored_states(stored_states).starts()
-
-    def close(self) -> None:
-        """Ends the environment."""
-        self._env.close()
-
-    def play(
-        self,
-        policy: Policy,
-        version: int,
-        mode: Mode,
-        number: int,
-        on_step: Callable[[], None] = lambda: None,
-    ) -> Episode:
-        """Plays an episode; whatever `on_step` raises after a step ends it.
-
-        Raises:
-            StorageError: No seed gives a sound attempt.
-        """
-        for attempt in range(GUARDED_ATTEMPTS):
-            trajectory = self._attempt(policy, version, mode, (number, attempt), on_step)
-            is_over = self._starts and trajectory.guard != GuardReason.ENGINE_LOST
-            if trajectory.guard is None or is_over:
-                return Episode(version, mode, number, trajectory.return_, trajectory.success)
-        raise StorageError(
-            f"evaluation episode {number}: expected a sound attempt with one of "
-            f"{GUARDED_ATTEMPTS} seeds; got {trajectory.guard}; mend the task or the simulator"
-        )
-
-    def _attempt(
-        self,
-        policy: Policy,
-        version: int,
-        mode: Mode,
-        number_and_attempt: tuple[int, int],
-        on_step: Callable[[], None],
-    ) -> Trajectory:
-        number, attempt = number_and_attempt
-        seed = derive_seed(self._preset.seed, EVALUATION_STREAM + number, attempt, 0)
-        ticket = Ticket(number, attempt, 0, seed, version, self._preset.task.horizon, 0.0)
-        acting = Greedy(policy) if mode == "greedy" else Sampled(policy)
-        id_ = TrajectoryId("evaluation", "evaluation", number)
-        start = self._starts[number].reset_options if self._starts else None
-        for _ in range(LOST_SIMULATORS):
-            trajectory = collect(self._env, acting, ticket, id_, on_step, start)
-            if trajectory.guard != GuardReason.ENGINE_LOST:
-                break
-        return trajectory
 
 
 # Keeping --------------------------------------------------------------------------------------

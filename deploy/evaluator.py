@@ -30,13 +30,14 @@ from broker_config.messages import Heartbeat, Snapshot
 from broker_config.preset import Preset, preset_from_json
 from deploy.announcer import Announcer
 from deploy.evaluation import (
+    WAITING_FOR_OWNER,
     Episode,
     EpisodeKey,
     Mode,
-    Player,
     Results,
     modes_of,
 )
+from deploy.player import Player
 from deploy.policy_shelf import PolicyShelf
 from deploy.priority import Priority, give_way
 from deploy.run_folder import RunFolder, prepare_run_folder
@@ -55,8 +56,6 @@ SILENCE_SECS = 1.5
 
 STEP_PATIENCE_SECS = 600.0
 """A step may take so long before the evaluator counts as hung: on a busy machine it starves."""
-
-WAITING_FOR_OWNER = "waiting for the owner"
 
 OWNER_FINISHED = "finished"
 """How the state of an owner that learns no more begins, as its heartbeats say."""

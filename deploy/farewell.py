@@ -8,7 +8,7 @@ import time
 from broker_config.bus import Bus
 from broker_config.keys import ParsedKey
 from broker_config.messages import Heartbeat
-from deploy.evaluator import WAITING_FOR_OWNER
+from deploy.evaluation import WAITING_FOR_OWNER
 from deploy.launch import Supervisor
 from deploy.progress import Progress
 

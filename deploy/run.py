@@ -1,31 +1,30 @@
-"""`clothbus run`: a whole run on this machine, over the bus or in one process."""
+"""`clothbus run`: a whole run on this machine, over the bus.
+
+Nothing here learns or acts, so neither torch nor a simulator is imported.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
 
-from actors.step_log import StepLog
-from actors.task import make_task_env
 from broker_config.bus import Bus, open_bus
 from broker_config.errors import OwnerUnreachable, RouterUnreachable
 from broker_config.heart import HUNG_SECS
-from broker_config.journal import Journal
 from broker_config.keys import Kind
 from broker_config.messages import Command, Control, ControlReply, Heartbeat, Metrics
-from broker_config.ownership import FileLock, own_run
+from broker_config.ownership import FileLock
 from broker_config.preset import Preset
 from deploy.farewell import EvaluatorFarewell
-from deploy.in_process import ACTOR, InProcessActor
 from deploy.launch import ProcessFailed, Supervisor
 from deploy.leftovers import deliver_spools, lacks_recording
 from deploy.priority import Priority
-from deploy.process import interrupt, on_terminate, take_when_free, use_one_torch_thread
+from deploy.process import interrupt, on_terminate, take_when_free
 from deploy.progress import Progress
 from deploy.recorder_farewell import RecorderFarewell
 from deploy.run_folder import RunFolder
@@ -40,13 +39,6 @@ from deploy.topology import (
     router_process,
 )
 from deploy.vital_signs import VitalSigns
-from learner.checkpoint import CheckpointStore
-from learner.learning import LearningLoop
-from learner.metrics import LearningMetrics
-from learner.owner import Owner
-from learner.recorded import read_demonstrations
-from learner.snapshots import SnapshotStore
-from learner.trainer import Trainer
 
 ROUTER_START_SECS = 30.0
 LEAVE_SECS = 10.0
@@ -96,30 +88,17 @@ def run_over_bus(folder: RunFolder, preset: Preset, options: RunOptions, console
         if options.record and lacks_recording(folder):
             _supervise(folder, replace(options, actors=0, evaluate=0), progress)
 
-    return _run(folder, preset, console, carry_out)
+    return conduct(folder, preset, console, carry_out)
 
 
-def run_in_process(
-    folder: RunFolder, preset: Preset, options: RunOptions, console: Console
-) -> bool:
-    """The same run in this process, without a bus.
-
-    Returns:
-        Whether the run is complete; False after Ctrl-C.
-    """
-
-    def carry_out(progress: Progress) -> None:
-        if is_complete(folder):
-            deliver_spools(folder, preset)
-        else:
-            _play_here(folder, preset, options, progress)
-
-    return _run(folder, preset, console, carry_out)
-
-
-def _run(
+def conduct(
     folder: RunFolder, preset: Preset, console: Console, carry_out: Callable[[Progress], None]
 ) -> bool:
+    """Carries out a run with progress, until it ends or is stopped, and says how it went.
+
+    Returns:
+        Whether the run is complete.
+    """
     began_secs = time.monotonic()
     console.print(f"Run folder: {folder.path}", highlight=False, soft_wrap=True)
     on_terminate(interrupt)
@@ -250,29 +229,3 @@ def _start_router(supervisor: Supervisor, folder: RunFolder, options: RunOptions
         f"router: expected an address within {ROUTER_START_SECS:g} s; got none; "
         f"see {folder.log('router')}"
     )
-
-
-def _play_here(folder: RunFolder, preset: Preset, options: RunOptions, progress: Progress) -> None:
-    use_one_torch_thread()
-    task = make_task_env(preset.task)
-    with (
-        take_when_free(lambda: own_run(folder.path)),
-        Journal(folder.journal) as journal,
-        LearningMetrics(folder.tensorboard) as metrics,
-        closing(StepLog(task, options.step_log, ACTOR) if options.step_log else task) as env,
-    ):
-        owner = Owner(folder.run, preset, journal)
-        owner.control(Control(Command.RESUME))
-        snapshots = SnapshotStore(folder.snapshots)
-        loop = LearningLoop(
-            owner,
-            Trainer(preset, options.device),
-            CheckpointStore(folder.checkpoints),
-            snapshots,
-            read_demonstrations(options.demonstrations) if options.demonstrations else (),
-            InProcessActor(owner, env, snapshots).play_until_ready,
-        )
-        for event in loop:
-            metrics.note(event)
-            progress.update(metrics.numbers)
-            progress.show()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +14,13 @@ from broker_config.journal import JournalReader
 from broker_config.messages import SnapshotTaken, Trajectory
 from broker_config.preset import Preset
 from deploy.evaluation import Mode, Score, modes_of, read_results, scores_of
-from deploy.figures import ScoredPolicies, draw_film_strip, draw_learning_curve
 from deploy.run_folder import RunFolder
 from learner.recorded import accepted_trajectories
+
+if TYPE_CHECKING:
+    from deploy.figures import ScoredPolicies
+
+# What draws is imported when a run has ended: its beginning shall not wait for matplotlib.
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,8 @@ def is_complete(folder: RunFolder) -> bool:
 
 
 def _draw(folder: RunFolder, preset: Preset, episodes: _Episodes, scores: Sequence[Score]) -> None:
+    from deploy.figures import draw_film_strip, draw_learning_curve
+
     draw_learning_curve(
         folder.curve,
         preset.name,
@@ -85,6 +92,8 @@ def _draw(folder: RunFolder, preset: Preset, episodes: _Episodes, scores: Sequen
 
 
 def _scored(preset: Preset, scores: Sequence[Score], mode: Mode) -> ScoredPolicies:
+    from deploy.figures import ScoredPolicies
+
     # One episode has no interval.
     of_mode = [score for score in scores if score.mode == mode and score.episodes > 1]
     return ScoredPolicies(

@@ -18,7 +18,7 @@ from torch import Tensor
 from actors.networks import PreferenceNetwork
 from learner.gradient_steps import preference_loss
 from learner.memory import LocalMemory
-from learner.optimiser import named_state
+from learner.optimiser import FusedAdam, named_state
 
 _TABLE_ROWS = 2048
 """Minibatches that are handed to the device at a time."""
@@ -79,7 +79,7 @@ class GraphedSteps:
     def __init__(
         self,
         network: PreferenceNetwork,
-        optimiser: torch.optim.Optimizer,
+        optimiser: FusedAdam,
         memory: LocalMemory,
         record: Record = record_cuda_graph,
     ) -> None:
@@ -155,8 +155,7 @@ class GraphedSteps:
         loss = preference_loss(
             self._network, observations, self._actions[batch], self._targets[batch]
         )
-        # Without old gradients, backward writes new ones instead of adding to them.
-        self._optimiser.zero_grad(set_to_none=True)
+        self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self._optimiser.step()
         table.losses.index_copy_(0, table.cursor, loss.detach().unsqueeze(0))

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from actors.networks import PreferenceNetwork
 from learner.memory import LocalMemory
+from learner.optimiser import FusedAdam
 
 
 def preference_loss(
@@ -48,7 +49,7 @@ class EagerSteps:
     """Makes the steps one operation at a time."""
 
     def __init__(
-        self, network: PreferenceNetwork, optimiser: torch.optim.Optimizer, memory: LocalMemory
+        self, network: PreferenceNetwork, optimiser: FusedAdam, memory: LocalMemory
     ) -> None:
         self._network = network
         self._optimiser = optimiser
@@ -61,7 +62,7 @@ class EagerSteps:
         for step, batch in enumerate(batches):
             observations = self._memory.ring[positions[batch]]
             loss = preference_loss(self._network, observations, actions[batch], targets[batch])
-            self._optimiser.zero_grad(set_to_none=True)
+            self._optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self._optimiser.step()
             losses[step] = loss.detach()

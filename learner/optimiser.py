@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from broker_config.errors import StorageError
 from broker_config.preset import OptimiserPreset
@@ -14,39 +15,85 @@ _SATURATED_STEP = 2.0**24
 """A float32 step count that adding 1 does not change, and for which 1 - rho**count is 1."""
 
 
-def build_optimiser(preset: OptimiserPreset, network: nn.Module) -> torch.optim.Adam:
-    """The preset's optimiser for all parameters of a network, with its state allocated.
+class FusedAdam:
+    """Adam on torch's fused kernel, with its state allocated.
+
+    It makes the very steps of `torch.optim.Adam`, which as soon as it is made imports torch's
+    compiler: that takes longer than importing all the rest of torch, and nothing is compiled here.
+
+    The state's tensors are never replaced, only written: a CUDA graph may hold their addresses.
+
+    Attributes:
+        state: "step" f32[], "exp_avg" and "exp_avg_sq" of each parameter.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        learning_rate: float,
+        betas: tuple[float, float],
+        epsilon: float,
+        first_step: float = 0.0,
+    ) -> None:
+        """Allocates the state of all parameters of a network; steps count from `first_step`."""
+        self._parameters = list(network.parameters())
+        self._learning_rate = learning_rate
+        self._betas = betas
+        self._epsilon = epsilon
+        self.state = {
+            parameter: {
+                "step": torch.tensor(first_step, dtype=torch.float32, device=parameter.device),
+                "exp_avg": torch.zeros_like(parameter),
+                "exp_avg_sq": torch.zeros_like(parameter),
+            }
+            for parameter in self._parameters
+        }
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients: backward then writes new ones instead of adding to them."""
+        for parameter in self._parameters:
+            parameter.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Makes a step with every parameter that has a gradient."""
+        steps = [(it, it.grad, self.state[it]) for it in self._parameters if it.grad is not None]
+        if not steps:
+            return
+        adam(
+            [parameter for parameter, _, _ in steps],
+            [gradient for _, gradient, _ in steps],
+            [state["exp_avg"] for _, _, state in steps],
+            [state["exp_avg_sq"] for _, _, state in steps],
+            [],
+            [state["step"] for _, _, state in steps],
+            fused=True,
+            capturable=steps[0][0].device.type == "cuda",
+            amsgrad=False,
+            beta1=self._betas[0],
+            beta2=self._betas[1],
+            lr=self._learning_rate,
+            weight_decay=0.0,
+            eps=self._epsilon,
+            maximize=False,
+        )
+
+
+def build_optimiser(preset: OptimiserPreset, network: nn.Module) -> FusedAdam:
+    """The preset's optimiser for all parameters of a network.
 
     RMSProp is the old Keras form, which the source's software had: v = rho * v + (1 - rho) * g**2
     and theta -= rate * g / (sqrt(v) + epsilon). That is Adam without momentum (beta1 = 0) and
     without bias correction (a step count so large that there is none left), so that the fused
     kernel serves both: one pass over the parameters, and one launch on a GPU.
-
-    The state's tensors are never replaced, only written: a CUDA graph may hold their addresses.
     """
-    device = next(network.parameters()).device
-    is_rmsprop = preset.name == "rmsprop"
-    optimiser = torch.optim.Adam(
-        network.parameters(),
-        lr=preset.learning_rate,
-        betas=(0.0, preset.smoothing) if is_rmsprop else (0.9, 0.999),
-        eps=preset.epsilon,
-        fused=True,
-        capturable=device.type == "cuda",
-    )
-    first_step = _SATURATED_STEP if is_rmsprop else 0.0
-    for parameter in network.parameters():
-        optimiser.state[parameter] = {
-            "step": torch.tensor(first_step, dtype=torch.float32, device=device),
-            "exp_avg": torch.zeros_like(parameter),
-            "exp_avg_sq": torch.zeros_like(parameter),
-        }
-    return optimiser
+    rate, epsilon = preset.learning_rate, preset.epsilon
+    if preset.name == "rmsprop":
+        return FusedAdam(network, rate, (0.0, preset.smoothing), epsilon, _SATURATED_STEP)
+    return FusedAdam(network, rate, (0.9, 0.999), epsilon)
 
 
-def named_state(
-    optimiser: torch.optim.Optimizer, network: nn.Module
-) -> Iterator[tuple[str, Tensor]]:
+def named_state(optimiser: FusedAdam, network: nn.Module) -> Iterator[tuple[str, Tensor]]:
     """The optimiser's own tensors (not copies), named after the parameters that they belong to."""
     for name, parameter in network.named_parameters():
         for part, tensor in sorted(optimiser.state[parameter].items()):

@@ -6,7 +6,6 @@ lie points of its own, so that hems and cuffs are straight whatever the garment'
 
 import cv2
 import numpy as np
-from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 
 from actors.cloth.meshes import ClothMesh
@@ -27,6 +26,9 @@ def triangulated(outline: Outline, spacing_m: float) -> ClothMesh:
     Raises:
         ValueError: the spacing is too large for the outline's narrow parts.
     """
+    # Only garments need it, and it brings all of matplotlib.
+    from matplotlib.tri import Triangulation
+
     corners = outline.corners_m
     rim = _along(corners, spacing_m)
     grid, cells = _grid_inside(corners, spacing_m)

@@ -13,17 +13,16 @@
 Every `info` holds `success` (bool) and `guard` (None, or why the step must not be learned from).
 """
 
+import importlib
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any, Final, SupportsIndex
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final, SupportsIndex
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.envs.cloth_options import ClothTaskOptions
-from actors.envs.cloth_task import ClothTaskEnv
 from actors.envs.difficulties import (
     FLIPPING,
     FOLDING,
@@ -31,11 +30,14 @@ from actors.envs.difficulties import (
     Difficulty,
     check_difficulty,
 )
-from actors.envs.fold_lines import FoldLinesEnv
-from actors.envs.handkerchief import HandkerchiefFlipEnv
-from actors.envs.reaching import ReachingEnv
-from actors.envs.tshirt import VIEW_HALF_WIDTH_M as TSHIRT_VIEW_M
-from actors.envs.tshirt import TshirtFoldEnv
+
+if TYPE_CHECKING:
+    from actors.envs.cloth_options import ClothTaskOptions
+    from actors.envs.cloth_task import ClothTaskEnv
+    from actors.envs.fold_lines import FoldLinesEnv
+    from actors.envs.handkerchief import HandkerchiefFlipEnv
+    from actors.envs.reaching import ReachingEnv
+    from actors.envs.tshirt import TshirtFoldEnv
 
 __all__ = [
     "ENV_IDS",
@@ -49,6 +51,30 @@ __all__ = [
     "make_env",
 ]
 
+_HOMES: Final[Mapping[str, str]] = {
+    "ClothTaskEnv": "cloth_task",
+    "ClothTaskOptions": "cloth_options",
+    "FoldLinesEnv": "fold_lines",
+    "HandkerchiefFlipEnv": "handkerchief",
+    "ReachingEnv": "reaching",
+    "TshirtFoldEnv": "tshirt",
+}
+"""In which module of this package each class is."""
+
+
+def _load(name: str) -> Any:
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """Imports a class when it is asked for: an arm that reaches needs no cloth engine."""
+        if name not in _HOMES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return _load(name)
+
+
 ClothbusEnv = gymnasium.Env[NDArray[np.uint8], SupportsIndex]
 
 
@@ -56,8 +82,14 @@ ClothbusEnv = gymnasium.Env[NDArray[np.uint8], SupportsIndex]
 class _Task:
     """An environment's class and what its id fixes; the rest are the class's defaults."""
 
-    env_class: type[ClothbusEnv]
+    class_name: str
     arguments: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def env_class(self) -> type[ClothbusEnv]:
+        """The class."""
+        loaded: type[ClothbusEnv] = _load(self.class_name)
+        return loaded
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -82,11 +114,16 @@ class _ClothTask(_Task):
     difficulties: Mapping[Difficulty, Mapping[str, Any]] = field(default_factory=dict)
     """Further options, where the task has difficulties."""
 
+    @property
+    def _options_class(self) -> "type[ClothTaskOptions]":
+        loaded: type[ClothTaskOptions] = _load("ClothTaskOptions")
+        return loaded
+
     def known(self) -> list[str]:
         """Names of all keywords that a call takes."""
         own = [name for name in super().known() if name != "options"]
         own += ["difficulty"] if self.difficulties else []
-        return own + [option.name for option in fields(ClothTaskOptions)]
+        return own + list(self._options_class.__dataclass_fields__)
 
     def __call__(self, **given: Any) -> ClothbusEnv:
         """The environment."""
@@ -95,32 +132,31 @@ class _ClothTask(_Task):
             difficulty = given.pop("difficulty", "medium")
             check_difficulty(difficulty)
             further = self.difficulties[difficulty]
-        is_option = ClothTaskOptions.__dataclass_fields__.__contains__
+        is_option = self._options_class.__dataclass_fields__.__contains__
         own = {name: given.pop(name) for name in list(given) if not is_option(name)}
-        return super().__call__(
-            **own, options=ClothTaskOptions(**{**self.options, **further, **given})
-        )
+        options = self._options_class(**{**self.options, **further, **given})
+        return super().__call__(**own, options=options)
 
 
 _TASKS: Final[Mapping[str, _Task]] = {
-    "clothbus/Reaching-v0": _Task(ReachingEnv),
+    "clothbus/Reaching-v0": _Task("ReachingEnv"),
     "clothbus/HandkerchiefFlip36-v0": _ClothTask(
-        HandkerchiefFlipEnv, {"pick_rule": "grid"}, {}, FLIPPING
+        "HandkerchiefFlipEnv", {"pick_rule": "grid"}, {}, FLIPPING
     ),
     "clothbus/HandkerchiefFlip60-v0": _ClothTask(
-        HandkerchiefFlipEnv, {"pick_rule": "contour"}, {"initial_state": "random"}, FLIPPING
+        "HandkerchiefFlipEnv", {"pick_rule": "contour"}, {"initial_state": "random"}, FLIPPING
     ),
     "clothbus/TShirtFold-v0": _ClothTask(
-        TshirtFoldEnv, {}, {"horizon": 8, "view_half_width_m": TSHIRT_VIEW_M}, TSHIRT
+        "TshirtFoldEnv", {}, {"horizon": 8, "view_half_width_m": 0.32}, TSHIRT
     ),
     "clothbus/ShirtFold-v0": _ClothTask(
-        FoldLinesEnv, {"garment": "shirt"}, {"horizon": 3, "view_half_width_m": 0.32}, FOLDING
+        "FoldLinesEnv", {"garment": "shirt"}, {"horizon": 3, "view_half_width_m": 0.32}, FOLDING
     ),
     "clothbus/TrousersFold-v0": _ClothTask(
-        FoldLinesEnv, {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}, FOLDING
+        "FoldLinesEnv", {"garment": "trousers"}, {"horizon": 2, "view_half_width_m": 0.32}, FOLDING
     ),
     "clothbus/HandkerchiefFold-v0": _ClothTask(
-        FoldLinesEnv,
+        "FoldLinesEnv",
         {"garment": "handkerchief"},
         {"horizon": 2, "observation_px": 32, "robot_stance": "left"},
         FOLDING,

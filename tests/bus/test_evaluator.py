@@ -27,8 +27,8 @@ from broker_config.messages import (
 )
 from broker_config.queries import Responder
 from deploy.evaluate import evaluate
-from deploy.evaluation import Results, read_results
-from deploy.evaluator import WAITING_FOR_OWNER, Evaluator
+from deploy.evaluation import WAITING_FOR_OWNER, Results, read_results
+from deploy.evaluator import Evaluator
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, prepare_run_folder
 from learner.snapshots import SnapshotStore

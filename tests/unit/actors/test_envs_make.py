@@ -1,7 +1,9 @@
 import gymnasium
 import pytest
 
-from actors.envs import ENV_IDS, HandkerchiefFlipEnv, ReachingEnv, make_env
+import actors.envs
+from actors.envs import ENV_IDS, HandkerchiefFlipEnv, ReachingEnv, TshirtFoldEnv, make_env
+from actors.envs.tshirt import VIEW_HALF_WIDTH_M
 
 
 def test_the_ids_are_registered_with_gymnasium() -> None:
@@ -16,6 +18,18 @@ def test_each_id_makes_its_task() -> None:
         assert isinstance(env, HandkerchiefFlipEnv)
         assert env.action_space.n == n_actions  # type: ignore[attr-defined]
         env.close()
+
+
+def test_the_t_shirt_is_seen_as_its_drop_points_expect() -> None:
+    env = make_env("clothbus/TShirtFold-v0")
+    assert isinstance(env, TshirtFoldEnv)
+    assert env.options.view_half_width_m == VIEW_HALF_WIDTH_M
+    env.close()
+
+
+def test_a_name_that_is_no_class_of_a_task_is_refused() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'ShirtFoldEnv'"):
+        _ = actors.envs.ShirtFoldEnv  # type: ignore[attr-defined]
 
 
 def test_an_unknown_id_names_the_known_ones() -> None:

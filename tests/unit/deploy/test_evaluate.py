@@ -13,11 +13,10 @@ import pytest
 from actors.envs.stored_states import read_stored_states, write_stored_states
 from actors.policy import Policy
 from broker_config.errors import AlreadyOwned, PresetError, StorageError
-from deploy import evaluation
+from deploy import player
 from deploy.evaluate import evaluate, evaluate_on_stored_states, stored_score_table
 from deploy.evaluation import (
     Episode,
-    Player,
     Results,
     bootstrap_interval,
     modes_of,
@@ -26,6 +25,7 @@ from deploy.evaluation import (
 )
 from deploy.evaluator import next_episode
 from deploy.make_states import make_states
+from deploy.player import Player
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, create_run_folder
 from learner.snapshots import SnapshotStore
@@ -155,8 +155,8 @@ def test_an_episode_from_a_stored_state_that_the_guard_ends_has_failed(
         object.__setattr__(trajectory, "success", False)
         return trajectory
 
-    collect, guards = evaluation.collect, iter(["engine_lost", "overstretched"])
-    monkeypatch.setattr(evaluation, "collect", collect_guarded)
+    collect, guards = player.collect, iter(["engine_lost", "overstretched"])
+    monkeypatch.setattr(player, "collect", collect_guarded)
     preset = flipping.read_preset()
     policy = Policy(preset.network, Trainer(preset).weights())
     episode = Player(preset, str(stored)).play(policy, 0, "greedy", 4)
@@ -270,8 +270,8 @@ def test_a_lost_simulator_does_not_change_the_seed(monkeypatch: pytest.MonkeyPat
         object.__setattr__(trajectory, "guard", next(losses, None))
         return trajectory
 
-    collect = evaluation.collect
-    monkeypatch.setattr(evaluation, "collect", collect_with_losses)
+    collect = player.collect
+    monkeypatch.setattr(player, "collect", collect_with_losses)
     assert Player(preset).play(policy, 0, "sampled", 3) == expected
     assert next(losses, None) is None
     losses = iter(["overstretched"])

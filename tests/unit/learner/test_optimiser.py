@@ -4,7 +4,7 @@ from torch import nn
 
 from broker_config.errors import StorageError
 from broker_config.preset import OptimiserPreset
-from learner.optimiser import build_optimiser, named_state, overwrite
+from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
 
 RMSPROP = OptimiserPreset("rmsprop", 2.5e-3, 1e-2, 0.95)
 ADAM = OptimiserPreset("adam", 2.5e-3, 1e-8)
@@ -15,7 +15,9 @@ def layer() -> nn.Linear:
     return nn.Linear(4, 3)
 
 
-def descend(network: nn.Linear, optimiser: torch.optim.Optimizer, n_steps: int) -> torch.Tensor:
+def descend(
+    network: nn.Linear, optimiser: FusedAdam | torch.optim.Optimizer, n_steps: int
+) -> torch.Tensor:
     for step in range(n_steps):
         inputs = torch.randn(8, 4, generator=torch.Generator().manual_seed(step))
         optimiser.zero_grad()

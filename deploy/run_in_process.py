@@ -1,0 +1,72 @@
+"""`clothbus run --in-process`: a whole run in this process, without a bus."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+from rich.console import Console
+
+from actors.step_log import StepLog
+from actors.task import make_task_env
+from broker_config.journal import Journal
+from broker_config.messages import Command, Control
+from broker_config.ownership import own_run
+from broker_config.preset import Preset
+from deploy.in_process import ACTOR, InProcessActor
+from deploy.leftovers import deliver_spools
+from deploy.process import take_when_free, use_one_torch_thread
+from deploy.progress import Progress
+from deploy.run import RunOptions, conduct
+from deploy.run_folder import RunFolder
+from deploy.summary import is_complete
+from learner.checkpoint import CheckpointStore
+from learner.learning import LearningLoop
+from learner.metrics import LearningMetrics
+from learner.owner import Owner
+from learner.recorded import read_demonstrations
+from learner.snapshots import SnapshotStore
+from learner.trainer import Trainer
+
+
+def run_in_process(
+    folder: RunFolder, preset: Preset, options: RunOptions, console: Console
+) -> bool:
+    """Carries out a run in this process, with the cores that a run over the bus has.
+
+    Returns:
+        Whether the run is complete; False after Ctrl-C.
+    """
+
+    def carry_out(progress: Progress) -> None:
+        if is_complete(folder):
+            deliver_spools(folder, preset)
+        else:
+            _play(folder, preset, options, progress)
+
+    return conduct(folder, preset, console, carry_out)
+
+
+def _play(folder: RunFolder, preset: Preset, options: RunOptions, progress: Progress) -> None:
+    use_one_torch_thread()
+    task = make_task_env(preset.task)
+    with (
+        take_when_free(lambda: own_run(folder.path)),
+        Journal(folder.journal) as journal,
+        LearningMetrics(folder.tensorboard) as metrics,
+        closing(StepLog(task, options.step_log, ACTOR) if options.step_log else task) as env,
+    ):
+        owner = Owner(folder.run, preset, journal)
+        owner.control(Control(Command.RESUME))
+        snapshots = SnapshotStore(folder.snapshots)
+        loop = LearningLoop(
+            owner,
+            Trainer(preset, options.device),
+            CheckpointStore(folder.checkpoints),
+            snapshots,
+            read_demonstrations(options.demonstrations) if options.demonstrations else (),
+            InProcessActor(owner, env, snapshots).play_until_ready,
+        )
+        for event in loop:
+            metrics.note(event)
+            progress.update(metrics.numbers)
+            progress.show()
