@@ -1,7 +1,7 @@
 """The fast engine: XPBD cloth that repeats itself bit by bit and returns to any saved state."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,23 @@ from actors.cloth.gestures import Gesture, hand_paths_in_world, turns_in_world
 from actors.cloth.meshes import ClothMesh
 from actors.cloth.xpbd_constraints import distance_constraints
 from actors.cloth.xpbd_settings import XpbdSettings
-from actors.cloth.xpbd_solver import Body, Distances, Numbers, advance, share_corrections
+from actors.cloth.xpbd_solver import (
+    Body,
+    Distances,
+    Numbers,
+    advance,
+    most_stretch,
+    share_corrections,
+)
 
 FRAME_SECS = 1 / 60
 """How often it is looked whether the cloth has come to rest."""
 RESTING_FRAMES = 3
 """So many slow frames in a row are rest: cloth that turns back is slow for one."""
 SKIN_THICKNESSES = 1.0
+SLIPS_AT = 1.5
+"""Cloth that is stretched to so many times its length while fingers hold it slips out of them. Only
+what is caught in itself resists a hand so much: carried on, it would tear."""
 NEIGHBOUR_SPACINGS = 1.5
 """Vertices so close at rest, along a diagonal at most, never count as layers."""
 ROOM_FOR_PAIRS = 64
@@ -93,8 +103,7 @@ class XpbdEngine:
         grasped = np.concatenate([hand.grasped for hand in gesture.hands])
         path_m = self._grasped_path_m(gesture)
         self._hold(grasped)
-        for piece_m in self._pieces(path_m, film):
-            self._advance(len(piece_m), grasped, piece_m)
+        self._carry(grasped, path_m, film)
         self._hold(_NOTHING)
         self._body.velocities_m_per_s[:, grasped] = 0.0  # fingers stop before they open
         self._settle(gesture.motion.settle_secs)
@@ -183,17 +192,24 @@ class XpbdEngine:
             held_m.append(way_m)
         return np.concatenate(held_m, axis=1)
 
-    def _pieces(
-        self, path_m: NDArray[np.float64], film: Film | None
-    ) -> Iterator[NDArray[np.float64]]:
-        """A path f64[K, k, 3], whole, or cut where the cloth is filmed before it goes on."""
-        if film is None:
-            yield path_m
-            return
-        n_substeps = max(1, round(film.every_secs / self._numbers.substep_secs))
-        for first in range(0, len(path_m), n_substeps):
-            film.frames.append(self.vertices_in_world())
-            yield path_m[first : first + n_substeps]
+    def _carry(
+        self, grasped: NDArray[np.int64], path_m: NDArray[np.float64], film: Film | None
+    ) -> None:
+        """Take what is grasped along a path f64[K, k, 3], as long as the fingers can hold it."""
+        substep_secs = self._numbers.substep_secs
+        n_frame = round(FRAME_SECS / substep_secs)
+        n_film = len(path_m) if film is None else max(1, round(film.every_secs / substep_secs))
+        starts = sorted({*range(0, len(path_m), n_frame), *range(0, len(path_m), n_film)})
+        for start, end in pairwise([*starts, len(path_m)]):
+            if film is not None and start % n_film == 0:
+                film.frames.append(self.vertices_in_world())
+            self._advance(end - start, grasped, path_m[start:end])
+            if end % n_frame == 0 and self._slips():
+                return
+
+    def _slips(self) -> bool:
+        """Whether the cloth is stretched so much that it slips out of the fingers."""
+        return bool(most_stretch(self._body, self._distances) > SLIPS_AT)
 
     def _settle(self, least_secs: float) -> None:
         """Waits until the cloth lies still, at least and at most for a time."""

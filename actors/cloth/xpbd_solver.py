@@ -131,6 +131,19 @@ def advance(
     return float(_fastest(body))
 
 
+@_compiled  # type: ignore[untyped-decorator]
+def most_stretch(body: Body, distances: Distances) -> float:
+    """Length over length at rest of the pair that is stretched most."""
+    x, y, z = body.positions_m
+    pairs, squares = distances.pairs, distances.squared_lengths_m2
+    most = 0.0
+    for c in range(len(pairs)):
+        i, j = pairs[c, 0], pairs[c, 1]
+        dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
+        most = max(most, (dx * dx + dy * dy + dz * dz) / squares[c])
+    return float(np.sqrt(most))
+
+
 @_compiled
 def _move(body, numbers):  # type: ignore[no-untyped-def]
     x, y, z = body.positions_m

@@ -86,6 +86,17 @@ def test_two_hands_fold_one_half_over_the_other(engine: XpbdEngine) -> None:
     assert np.ptp(folded[:, 1]) > 0.28
 
 
+def test_cloth_slips_out_of_hands_that_would_tear_it(engine: XpbdEngine) -> None:
+    engine.reset(SHEET)
+    sides = [np.flatnonzero(np.isclose(SHEET.vertices_m[:, 0], x_m)) for x_m in (-0.15, 0.15)]
+    apart = [np.array([[x_m, 0.0, 0.05]]) for x_m in (-0.4, 0.4)]
+    hands = tuple(Hand(ids, stations) for ids, stations in zip(sides, apart, strict=True))
+    engine.perform(Gesture(hands))
+    pulled = engine.vertices_in_world()
+    assert guard(SHEET, pulled) is None
+    assert np.ptp(pulled[:, 0]) < 0.35
+
+
 def test_crumpled_cloth_keeps_its_lengths_and_its_layers_apart(engine: XpbdEngine) -> None:
     vertices = _crumple(engine, 8)
     stretch = edge_lengths_m(vertices, SHEET.edges) / SHEET.rest_edge_lengths_m
