@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actors.policy import Policy
 from actors.rollout import ActingPolicy, Observation
 from broker_config.preset import AlgorithmPreset
+
+if TYPE_CHECKING:
+    from actors.policy import Policy  # brings torch, which scripts and chance do without
 
 
 @dataclass(frozen=True)

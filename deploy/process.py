@@ -48,8 +48,10 @@ _asked_by = signal.SIGINT
 
 def child_environment() -> Mapping[str, str]:
     """The environment for a child process that must not outlive this one."""
-    single = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**os.environ, **single, PARENT_VARIABLE: str(os.getpid())}
+    torch = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    # Importing it would look through all installed packages for devices that we do not use.
+    torch["TORCH_DEVICE_BACKEND_AUTOLOAD"] = "0"
+    return {**os.environ, **torch, PARENT_VARIABLE: str(os.getpid())}
 
 
 def end_with_supervisor() -> None:

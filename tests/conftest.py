@@ -122,6 +122,14 @@ def attach(router: RouterProcess, run_name: str) -> Iterator[Attach]:
         yield lambda role, name: stack.enter_context(open_bus(router.address, run_name, role, name))
 
 
+def until_declared(bus: Bus) -> None:
+    """Returns when the router has heard of everything that a bus serves and subscribes to.
+
+    A question that comes earlier has nobody who serves it; a message has nobody who reads it.
+    """
+    bus.alive()  # a round trip on the same link
+
+
 @pytest.fixture
 def wait_until() -> Callable[..., None]:
     """Waits for a condition: `wait_until(lambda: x, 'x comes true')`."""

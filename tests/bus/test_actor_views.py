@@ -13,6 +13,7 @@ from actors.rollout import Step
 from actors.views import Views
 from broker_config.keys import Kind
 from broker_config.messages import Ticket, View
+from tests.conftest import until_declared
 
 TICKET = Ticket(3, 1, 0, 7, 5, 200, 0.0)
 
@@ -32,6 +33,7 @@ def listen(attach: Any) -> list[View]:
     heard: list[View] = []
     observer = attach("observer", "watching")
     observer.subscribe(observer.keys.every(Kind.VIEW), View, lambda _, view: heard.append(view))
+    until_declared(observer)
     return heard
 
 

@@ -33,6 +33,7 @@ from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, prepare_run_folder
 from learner.snapshots import SnapshotStore
 from learner.trainer import Trainer
+from tests.conftest import until_declared
 
 PRESET = load_preset("reaching-smoke", ["schedule.iterations=3"])
 """Versions 0, 2, 4 and 6 are the ends of its iterations."""
@@ -137,6 +138,7 @@ def test_every_iteration_s_policy_is_fetched_and_the_last_is_scored_to_its_end(
     observer, heard = attach("observer", "test"), []
     pattern = observer.keys.every(Kind.METRICS)
     observer.subscribe(pattern, Metrics, lambda _, metrics: heard.append(metrics))
+    until_declared(observer)
     owner.publish(3)
     running = launch()
     wait_until(lambda: len(read_results(folder.evaluation)) == 8, "2 and 0 are scored")

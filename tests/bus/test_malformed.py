@@ -16,7 +16,7 @@ from broker_config.heart import Heart, Pulse
 from broker_config.keys import Kind, ParsedKey
 from broker_config.messages import Heartbeat, TicketReply
 from broker_config.session import open_session
-from tests.conftest import Attach, RouterProcess
+from tests.conftest import Attach, RouterProcess, until_declared
 from tests.malformed import ROWS, VALID, forged_key, hand_made, is_refused, malformed
 
 QUERIES = [row.kind for row in CONTRACT if row.delivery is Delivery.QUERY]
@@ -39,6 +39,7 @@ def test_each_malformed_question_is_refused_and_counted(
     owner, forger = attach("owner", "owner"), attach("actor", "forger")
     served: list[object] = []
     owner.serve(owner.keys.every(kind), ROWS[kind].messages[0], lambda *it: served.append(it))
+    until_declared(owner)
     key = forged_key(run_name, kind)
     pending = [
         forger.ask_later(key, bad.payload, TicketReply, timeout_secs=30)
@@ -65,6 +66,7 @@ def test_each_malformed_message_is_dropped_and_counted(
     reader = attach("recorder", "recorder")
     taken: list[object] = []
     reader.subscribe(reader.keys.every(kind), ROWS[kind].messages[0], lambda *it: taken.append(it))
+    until_declared(reader)
     key, bad = forged_key(run_name, kind), malformed(run_name, kind, PER_KEY, seed=2)
     with open_session("client", router.address) as session:
         session.put(key, bad[0].payload, congestion_control=BLOCK)
@@ -85,6 +87,7 @@ def test_keys_that_are_none_are_counted_by_their_names(
     owner = attach("owner", "owner")
     for kind in (Kind.TICKET, Kind.ATTACH, Kind.POLICY_VERSION):
         owner.serve(owner.keys.every(kind), ROWS[kind].messages[0], lambda *_: None)
+    until_declared(owner)
     names = ["ticket/Upper", f"ticket/{'x' * 65}", "attach/king/id", "policy/007", "policy/-1"]
     wildcards = {"ticket/*": 1, "*/forger": 2, "attach/**": 1}
     expected = Counter({f"{run_name}/{name}": 1 for name in names})
@@ -128,6 +131,7 @@ def test_heartbeats_tell_how_much_was_rejected(
     owner, observer = attach("owner", "owner"), attach("observer", "observer")
     heard: list[Heartbeat] = []
     observer.subscribe(observer.keys.every(Kind.LIVE), Heartbeat, lambda _, it: heard.append(it))
+    until_declared(observer)
     for _ in range(3):
         owner.rejected.count("some/key", ValueError())
     with Heart(owner, "owner", "owner", "life", lambda: ("well", {"episode": 4}), Pulse()):

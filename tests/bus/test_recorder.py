@@ -37,6 +37,7 @@ from broker_config.recording import Recording, iter_recording
 from deploy.presets import load_preset
 from deploy.recorder import Recorder
 from learner.owner import Owner
+from tests.conftest import until_declared
 from tests.process.recorded import settle_recording
 
 PRESET = load_preset("reaching-smoke")
@@ -334,6 +335,7 @@ def test_a_full_disk_is_said_and_loses_nothing_of_the_journal(
     observer = attach("observer", "watching")
     key = observer.keys.live("recorder", "recorder")
     observer.subscribe(key, Heartbeat, lambda _, beat: states.append(beat.state))
+    until_declared(observer)
     host.take(0)
     running = start()
     wait_until(lambda: host.held and host.held[-1] > 0, "the recorder follows")

@@ -25,6 +25,7 @@ from broker_config.messages import (
     TicketRequest,
 )
 from broker_config.session import open_router_on_free_port, open_session
+from tests.conftest import until_declared
 
 
 def test_an_unreachable_router_is_reported_within_the_timeout(free_port):
@@ -32,7 +33,7 @@ def test_an_unreachable_router_is_reported_within_the_timeout(free_port):
     started = time.monotonic()
     with pytest.raises(RouterUnreachable, match=f"clothbus router --listen {address}"):
         open_session("client", address, ["connect/timeout_ms=300"])
-    assert time.monotonic() - started < 3
+    assert time.monotonic() - started < 4.5, "without the override it is 5 s"
 
 
 @pytest.mark.parametrize(
@@ -116,7 +117,7 @@ def test_an_asker_gets_its_answer_after_the_router_was_killed_and_restarted(own_
     ):
         owner.serve(owner.keys.control, Control, answer)
         owner.declare_alive()
-        owner.alive()
+        until_declared(owner)
         failures = []
 
         def is_answered():

@@ -135,7 +135,7 @@ def test_followers_that_ask_and_do_not_read_delay_no_ack(
         beside = ack_secs(bus, make_trajectory, 100)
     measured = f"acks alone: {_quantiles(alone)}; beside the followers: {_quantiles(beside)}"
     assert np.median(beside) < 5 * np.median(alone) + 0.1, measured
-    assert max(beside) < 2.0, measured
+    assert max(beside) < 4.0, measured  # a link that is blocked is closed after 5 s
 
 
 def _quantiles(secs: list[float]) -> str:

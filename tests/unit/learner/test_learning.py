@@ -31,34 +31,39 @@ Events = Iterator[PolicyReady | EpisodeAbsorbed]
 Begin = Callable[..., Events]
 
 
+def beginner(folder: Path, stack: ExitStack) -> Begin:
+    """Begins or resumes runs in folders of this one, as fresh processes would."""
+
+    def begin_one(
+        name: str = "run",
+        preset: Preset = PRESET,
+        demonstrations: list[Trajectory] | None = None,
+    ) -> Events:
+        run = folder / name
+        run.mkdir(exist_ok=True)
+        journal = stack.enter_context(Journal(run / "journal.sqlite"))
+        owner = Owner("run", preset, journal)
+        snapshots = SnapshotStore(run / "snapshots")
+        env = make_task_env(preset.task)
+        actor = InProcessActor(owner, env, snapshots)
+        loop = LearningLoop(
+            owner,
+            Trainer(preset),
+            CheckpointStore(run / "checkpoints"),
+            snapshots,
+            demonstrations or (),
+            actor.play_until_ready,
+        )
+        return iter(loop)
+
+    return begin_one
+
+
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Begin]:
     """Begins or resumes a run in a folder, as a fresh process would."""
     with ExitStack() as stack:
-
-        def begin_one(
-            name: str = "run",
-            preset: Preset = PRESET,
-            demonstrations: list[Trajectory] | None = None,
-        ) -> Events:
-            folder = tmp_path / name
-            folder.mkdir(exist_ok=True)
-            journal = stack.enter_context(Journal(folder / "journal.sqlite"))
-            owner = Owner("run", preset, journal)
-            snapshots = SnapshotStore(folder / "snapshots")
-            env = make_task_env(preset.task)
-            actor = InProcessActor(owner, env, snapshots)
-            loop = LearningLoop(
-                owner,
-                Trainer(preset),
-                CheckpointStore(folder / "checkpoints"),
-                snapshots,
-                demonstrations or (),
-                actor.play_until_ready,
-            )
-            return iter(loop)
-
-        yield begin_one
+        yield beginner(tmp_path, stack)
 
 
 def final_weights(events: Events) -> bytes:
@@ -87,19 +92,27 @@ def test_once_per_iteration_updates_at_its_end_only(begin: Begin) -> None:
     assert kinds == [PolicyReady, *absorbed, PolicyReady, *absorbed, PolicyReady]
 
 
-@pytest.mark.parametrize("update_every", ["episode", "iteration"])
+@pytest.fixture(scope="module", params=["episode", "iteration"])
+def undisturbed(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Preset, bytes]:
+    """A preset, and the weights with which its run ends."""
+    settings = ["schedule.iterations=3", f"schedule.update_every={request.param}"]
+    preset = load_preset("reaching-smoke", settings)
+    with ExitStack() as stack:
+        begin = beginner(tmp_path_factory.mktemp("undisturbed"), stack)
+        return preset, final_weights(begin(preset=preset))
+
+
 @pytest.mark.parametrize("stops_after", [1, 2, 4, 5, 7])
 def test_a_run_that_dies_anywhere_ends_with_the_same_weights(
-    begin: Begin, update_every: str, stops_after: int
+    begin: Begin, undisturbed: tuple[Preset, bytes], stops_after: int
 ) -> None:
-    preset = load_preset(
-        "reaching-smoke", ["schedule.iterations=3", f"schedule.update_every={update_every}"]
-    )
-    undisturbed = final_weights(begin("undisturbed", preset))
+    preset, expected = undisturbed
     dying = begin("dying", preset)
     for _ in range(stops_after):
         next(dying, None)
-    assert final_weights(begin("dying", preset)) == undisturbed
+    assert final_weights(begin("dying", preset)) == expected
 
 
 def test_snapshots_and_iterations_are_journalled_with_their_digests(
