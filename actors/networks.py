@@ -147,7 +147,10 @@ def allocate_network(spec: NetworkSpec) -> PreferenceNetwork:
     """
     with torch.device("meta"):
         network = PreferenceNetwork(spec)
-    network = network.to_empty(device="cpu")
+    # Not `to_empty`: its way through meta tensors imports sympy, half a second of every start.
+    for module in network.modules():
+        for name, parameter in module.named_parameters(recurse=False):
+            setattr(module, name, nn.Parameter(torch.empty(parameter.shape)))
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload] # not in its types
     return network
 
