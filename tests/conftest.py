@@ -134,7 +134,7 @@ def until_declared(bus: Bus) -> None:
 def wait_until() -> Callable[..., None]:
     """Waits for a condition: `wait_until(lambda: x, 'x comes true')`."""
 
-    def wait(condition: Callable[[], object], what: str, timeout_secs: float = 20.0) -> None:
+    def wait(condition: Callable[[], object], what: str, timeout_secs: float = 60.0) -> None:
         deadline = time.monotonic() + timeout_secs
         while not condition():
             assert time.monotonic() < deadline, f"waited {timeout_secs} s until {what}"

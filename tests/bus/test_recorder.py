@@ -165,7 +165,7 @@ def test_the_journal_and_its_policies_are_recorded_once_and_wholly(
     host.take(1, 3_000_000)
     host.take(2)
     host.append(*payloads[12:])
-    wait_until(lambda: host.held[-1] == host.journal.end_offset, "all is held", 60)
+    wait_until(lambda: host.held and host.held[-1] == host.journal.end_offset, "all is held")
     assert host.owner.followers.missing_versions() == frozenset()
     host.finish()
     assert running.wait() is True

@@ -9,15 +9,24 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from actors.task import make_task_env
 from broker_config.errors import BusError, StorageError
-from broker_config.journal import JOURNAL_FILE, JournalReader
+from broker_config.journal import JOURNAL_FILE, Journal, JournalReader
+from deploy.in_process import InProcessActor
+from deploy.presets import load_preset
 from deploy.status import ProcessStatus, only_run, read_status
+from learner.checkpoint import CheckpointStore
+from learner.learning import LearningLoop
+from learner.owner import Owner
+from learner.snapshots import SnapshotStore
+from learner.trainer import Trainer
 
-START_SECS = 60.0
+START_SECS = 120.0
 
 
 class Command:
@@ -90,7 +99,7 @@ def wait_for_lines(path: Path, count: int) -> None:
         time.sleep(0.002)
 
 
-def wait_for_trajectories(folder: Path, count: int, timeout_secs: float = 90.0) -> None:
+def wait_for_trajectories(folder: Path, count: int, timeout_secs: float = 120.0) -> None:
     """Waits until the journal holds so many trajectories."""
     deadline = time.monotonic() + timeout_secs
     while trajectories(folder) < count:
@@ -140,3 +149,27 @@ def _status(address: str) -> list[ProcessStatus]:
 def weights(folder: Path) -> bytes:
     """The newest policy of a run."""
     return max((folder / "snapshots").glob("*.safetensors")).read_bytes()
+
+
+def undisturbed_weights(folder: Path, *settings: str) -> bytes:
+    """The policy with which a run of the smoke preset ends when nothing happens to it.
+
+    It is played in this process, which has imported everything. That `clothbus run --in-process`
+    and runs over the bus come to the same, `test_runs.py` holds.
+    """
+    preset = load_preset("reaching-smoke", settings)
+    folder.mkdir()
+    with Journal(folder / JOURNAL_FILE) as journal, closing(make_task_env(preset.task)) as env:
+        owner = Owner("undisturbed", preset, journal)
+        snapshots = SnapshotStore(folder / "snapshots")
+        loop = LearningLoop(
+            owner,
+            Trainer(preset),
+            CheckpointStore(folder / "checkpoints"),
+            snapshots,
+            (),
+            InProcessActor(owner, env, snapshots).play_until_ready,
+        )
+        for _ in loop:
+            pass
+    return weights(folder)

@@ -34,7 +34,7 @@ RUN_SECS = 300.0
 def wait_for_results(folder: RunFolder, more: int) -> None:
     """Waits until the evaluator has written some more lines."""
     wanted = len(read_results(folder.evaluation)) + more
-    deadline_secs = time.monotonic() + 90
+    deadline_secs = time.monotonic() + 120
     while len(read_results(folder.evaluation)) < wanted:
         assert time.monotonic() < deadline_secs, f"waited for {wanted} results"
         time.sleep(0.02)

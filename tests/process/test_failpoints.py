@@ -17,6 +17,7 @@ from tests.process.conftest import (
     Start,
     the_run,
     trajectories,
+    undisturbed_weights,
     wait_for_file,
     wait_for_lines,
     wait_for_trajectories,
@@ -80,15 +81,13 @@ def test_runs_killed_at_failpoints_end_with_the_undisturbed_weights_and_lose_not
 ) -> None:
     """Each group has a run; they share the machine's cores."""
     named = ["run", "reaching-smoke", "--set", *SETTINGS, "--runs"]
-    undisturbed = start("undisturbed", *named, tmp_path / "undisturbed", "--in-process")
     runs = {}
     for group, points in GROUPS.items():
         folder = tmp_path / group
         arm(monkeypatch, folder / "flags", points, count=2)
         options = ["--actors", 1, "--no-record", "--step-log", folder / "steps.jsonl"]
         runs[group] = start(group, *named, folder / "runs", *options)
-    assert undisturbed.wait(RUN_SECS) == 0, undisturbed.log.read_text()[-3000:]
-    expected = weights(the_run(tmp_path / "undisturbed", undisturbed))
+    expected = undisturbed_weights(tmp_path / "undisturbed", *SETTINGS)
     for group, run in runs.items():
         assert run.wait(RUN_SECS) == 0, run.log.read_text()[-3000:]
         assert fired(tmp_path / group / "flags") == set(GROUPS[group])

@@ -30,6 +30,7 @@ from tests.process.conftest import (
     Start,
     the_run,
     trajectories,
+    undisturbed_weights,
     wait_for_trajectories,
     weights,
 )
@@ -41,9 +42,12 @@ RUN_SECS = 150.0
 WaitUntil = Callable[..., None]
 
 
+def settings(iterations: int) -> list[str]:
+    return [*SETTINGS, f"schedule.iterations={iterations}"]
+
+
 def arguments(runs: Path, iterations: int, *options: object) -> list[object]:
-    settings = [*SETTINGS, f"schedule.iterations={iterations}"]
-    return ["run", "reaching-smoke", "--runs", runs, *options, "--set", *settings]
+    return ["run", "reaching-smoke", "--runs", runs, *options, "--set", *settings(iterations)]
 
 
 def pid_of(run: Command, process: str) -> int:
@@ -93,14 +97,13 @@ def test_what_is_ended_or_hangs_is_started_again_and_who_is_drained_is_not(
     assert run.wait(60) == 143
     assert not any(Path(f"/proc/{pid}").exists() for pid in living)
     assert "Stopped: reaching-smoke" in (folder / "summary.txt").read_text()
+    assert not (folder / "recording").exists()
 
 
 @pytest.mark.timeout(300)
 def test_after_kill_9_of_the_supervisor_a_run_is_resumed_at_once_and_ends_once(
     start: Start, tmp_path: Path
 ) -> None:
-    undisturbed = start("undisturbed", *arguments(tmp_path / "undisturbed", 6, "--in-process"))
-    assert undisturbed.wait(RUN_SECS) == 0, undisturbed.log.read_text()[-3000:]
     step_log = tmp_path / "steps.jsonl"
     options = ["--actors", 2, "--step-log", step_log, "--no-record"]
     run = start("run", *arguments(tmp_path / "runs", 6, *options))
@@ -116,7 +119,7 @@ def test_after_kill_9_of_the_supervisor_a_run_is_resumed_at_once_and_ends_once(
     account = settle(step_log, folder / JOURNAL_FILE)
     assert account.acted == account.journalled + account.cut_off
     assert dict(account.accepted) == dict.fromkeys(range(12), HORIZON)
-    assert weights(folder) == weights(the_run(tmp_path / "undisturbed", undisturbed))
+    assert weights(folder) == undisturbed_weights(tmp_path / "undisturbed", *settings(6))
 
     with JournalReader(folder / JOURNAL_FILE) as journal:
         end_offset = journal.end_offset
@@ -155,8 +158,6 @@ def wait_for_text(command: Command, text: str) -> None:
 def test_a_locked_journal_and_a_full_disk_end_the_run_in_words_and_lose_nothing(
     start: Start, tmp_path: Path
 ) -> None:
-    undisturbed = start("undisturbed", *arguments(tmp_path / "undisturbed", 10, "--in-process"))
-    assert undisturbed.wait(RUN_SECS) == 0, undisturbed.log.read_text()[-3000:]
     step_log = tmp_path / "steps.jsonl"
     options = ["--actors", 2, "--step-log", step_log, "--no-record"]
     run = start("run", *arguments(tmp_path / "runs", 10, *options))
@@ -184,7 +185,7 @@ def test_a_locked_journal_and_a_full_disk_end_the_run_in_words_and_lose_nothing(
     account = settle(step_log, folder / JOURNAL_FILE)
     assert account.acted == account.journalled + account.cut_off
     assert dict(account.accepted) == dict.fromkeys(range(20), HORIZON)
-    assert weights(folder) == weights(the_run(tmp_path / "undisturbed", undisturbed))
+    assert weights(folder) == undisturbed_weights(tmp_path / "undisturbed", *settings(10))
 
 
 def last(command: Command) -> str:

@@ -86,16 +86,6 @@ def test_a_recorder_that_ends_at_each_of_its_failpoints_loses_nothing(
 
 
 @pytest.mark.timeout(200)
-def test_a_run_without_a_recorder_has_no_recording(start: Start, tmp_path: Path) -> None:
-    run = start("run", "run", "reaching-smoke", "--runs", tmp_path / "runs", "--no-record")
-    folder = the_run(tmp_path / "runs", run)
-    wait_for_trajectories(folder, 1)
-    run.process.send_signal(signal.SIGINT)
-    assert run.wait(60) == 130
-    assert not (folder / "recording").exists()
-
-
-@pytest.mark.timeout(200)
 def test_a_recorder_alone_says_how_it_ended(
     start: Start, tmp_path: Path, wait_until: Callable[..., None]
 ) -> None:
@@ -109,7 +99,7 @@ def test_a_recorder_alone_says_how_it_ended(
     assert second.wait(60) == 3
     assert "expected no other owner; got pid" in second.log.read_text()
     first.process.send_signal(signal.SIGTERM)
-    assert first.wait(30) == 143, first.log.read_text()
+    assert first.wait(60) == 143, first.log.read_text()
     assert next(item.topic for item in iter_recording(folder)) == "recorder"
     (folder / "000001.mcap").write_bytes(b"something else")
     third = start("third", *arguments)

@@ -21,7 +21,8 @@ SETTINGS = (
     "task.options.n_joints=5",
     "task.n_actions=25",
     f"task.horizon={HORIZON}",
-    "schedule.memory_samples=300",
+    "schedule.memory_samples=20",
+    "schedule.epochs=1",
     "schedule.iterations=3",
 )
 RUN_SECS = 150.0
@@ -82,10 +83,10 @@ def test_without_a_router_or_a_run_the_command_says_what_to_do(
     start: Start, tmp_path: Path, free_port: int
 ) -> None:
     nobody = start("nobody", "status", "--connect", f"tcp/127.0.0.1:{free_port}")
-    assert nobody.wait(30) == 4
+    assert nobody.wait(60) == 4
     assert f"clothbus router --listen tcp/127.0.0.1:{free_port}" in nobody.log.read_text()
     router = start("router", "router", "--address-file", tmp_path / "address")
     address = wait_for_file(tmp_path / "address", router)
     empty = start("empty", "status", "--connect", address)
-    assert empty.wait(30) == 3
+    assert empty.wait(60) == 3
     assert "expected one run; got none" in empty.log.read_text()

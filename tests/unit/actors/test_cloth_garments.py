@@ -89,7 +89,7 @@ def test_symmetries_are_those_of_the_shape() -> None:
         assert mirror.order[left] == right
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=20)
 @given(
     st.floats(0.7, 1.3), st.floats(0.8, 1.2), st.floats(0.7, 1.4), st.floats(0.1, 0.95),
     st.floats(0.6, 1.3),
