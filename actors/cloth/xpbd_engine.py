@@ -30,7 +30,7 @@ FRAME_SECS = 1 / 60
 RESTING_FRAMES = 3
 """So many slow frames in a row are rest: cloth that turns back is slow for one."""
 SKIN_THICKNESSES = 1.0
-SLIPS_AT = 1.5
+SLIPS_AT = 1.7
 """Cloth that is stretched to so many times its length while fingers hold it slips out of them. Only
 what is caught in itself resists a hand so much: carried on, it would tear."""
 NEIGHBOUR_SPACINGS = 1.5
