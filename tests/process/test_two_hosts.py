@@ -236,7 +236,7 @@ def _seen_twice(folder: Path) -> list[str]:
 )
 def test_a_wrong_address_is_named_with_what_to_do(start_on: StartOn, address: str) -> None:
     actor = start_on(ACTOR_HOST, "lost", "actor", "--connect", address, "--run", "run")
-    assert actor.wait(60) == 4
+    assert actor.wait(60) == 4, actor.log.read_text()
     said = " ".join(actor.log.read_text().split())
     assert f"router: expected an answer at {address}; got none" in said
     assert "check the address, the firewall" in said
