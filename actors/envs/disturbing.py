@@ -58,9 +58,7 @@ def crease(
     random: np.random.Generator,
 ) -> Gesture:
     """Pinch the cloth somewhere and set it down a few centimetres away, which leaves a crease."""
-    rows, columns = np.nonzero(mask)
-    pixel = int(random.integers(len(rows)))
-    pick_xy_m = camera.table_point_m((columns[pixel] + 0.5, rows[pixel] + 0.5))
+    pick_xy_m = _random_point_m(mask, camera, random)
     direction, length_m = random.uniform(-np.pi, np.pi), random.uniform(*CREASE_M)
     drop_xy_m = (
         pick_xy_m[0] + length_m * np.cos(direction),
@@ -77,9 +75,7 @@ def crumple(
     random: np.random.Generator,
 ) -> Gesture:
     """Pick the cloth up anywhere and drop it near the table's middle."""
-    rows, columns = np.nonzero(mask)
-    pixel = int(random.integers(len(rows)))
-    pick_xy_m = camera.table_point_m((columns[pixel] + 0.5, rows[pixel] + 0.5))
+    pick_xy_m = _random_point_m(mask, camera, random)
     x_m, y_m = random.uniform(-CRUMPLE_M, CRUMPLE_M, 2).tolist()
     return pick_and_drop(
         vertices_in_world, grasped_vertices(vertices_in_world, pick_xy_m), (x_m, y_m)
@@ -102,6 +98,15 @@ def fold_over(
     grasped = grasped_vertices(vertices_in_world, (x_m, y_m))
     drop_xy_m = (float(middle_m[0]), float(middle_m[1]))
     return pick_and_drop(vertices_in_world, grasped, drop_xy_m)
+
+
+def _random_point_m(
+    mask: NDArray[np.bool_], camera: Camera, random: np.random.Generator
+) -> tuple[float, float]:
+    """Any point of the table that the garment covers in the picture, as (x, y)."""
+    rows, columns = np.nonzero(mask)
+    pixel = int(random.integers(len(rows)))
+    return camera.table_point_m((columns[pixel] + 0.5, rows[pixel] + 0.5))
 
 
 def _is_crumpled(times: int, scene: Scene, flat_px: int) -> bool:
