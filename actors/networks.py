@@ -67,11 +67,27 @@ class PreferenceNetwork(nn.Module):
         for convolution in self.convolutions:
             features = torch.relu(convolution(features))
         features = features.flatten(1)
-        outputs: Tensor = self.action_output(torch.relu(self.action_hidden(features)))
-        if not self.is_dueling:
+        return self.head(*(torch.relu(layer(features)) for layer in self.hidden_layers))
+
+    @property
+    def hidden_layers(self) -> list[nn.Linear]:
+        """What reads the features: the action stream and, if dueling, the value stream."""
+        return [self.action_hidden, self.value_hidden] if self.is_dueling else [self.action_hidden]
+
+    def head(self, action_units: Tensor, value_units: Tensor | None = None) -> Tensor:
+        """Preferences from the hidden units of each stream.
+
+        Args:
+            action_units: f32[B, 512], after their ReLU.
+            value_units: The same of a dueling network's value stream.
+
+        Returns:
+            f32[B, A].
+        """
+        outputs: Tensor = self.action_output(action_units)
+        if value_units is None:
             return outputs
-        values: Tensor = self.value_output(torch.relu(self.value_hidden(features)))
-        return _join(self.spec, values, outputs)
+        return _join(self.spec, self.value_output(value_units), outputs)
 
 
 def _join(spec: NetworkSpec, values: Tensor, outputs: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from deploy.process import (
     log_to_stderr,
     unfinished_exit,
 )
+from learner.compute import Compute, TrainingPath
 
 SHORTEST_HUNG_SECS = 10.0
 
@@ -45,6 +46,7 @@ def run(
     runs: Path = Path("runs"),
     settings: Settings = (),
     device: str = "cpu",
+    training_path: TrainingPath | None = None,
     demonstrations: Path | None = None,
     connect: str | None = None,
     step_log: Path | None = None,
@@ -64,6 +66,7 @@ def run(
         runs: Where run folders are made.
         settings: Settings that replace the preset's: schedule.iterations=3.
         device: Where the learner computes: cpu, cuda.
+        training_path: How gradient steps are made; chosen by the device if not given.
         demonstrations: Folder of `clothbus collect`, for presets with an initialisation.
         connect: Address of a router that runs already; without it one is started.
         step_log: File for one line per step on the environment's side.
@@ -92,7 +95,7 @@ def run(
         folder = create_run_folder(runs, chosen)
     options = RunOptions(
         actors=actors,
-        device=device,
+        compute=Compute(device, training_path),
         address=connect,
         demonstrations=demonstrations,
         step_log=step_log,
@@ -164,6 +167,7 @@ def learner(
     settings: Settings = (),
     connect: str = DEFAULT_ADDRESS,
     device: str = "cpu",
+    training_path: TrainingPath | None = None,
     demonstrations: Path | None = None,
     hung_secs: float = HUNG_SECS,
     zenoh: tuple[str, ...] = (),
@@ -176,6 +180,7 @@ def learner(
         settings: Settings that replace the preset's.
         connect: Address of the router.
         device: Where to compute: cpu, cuda.
+        training_path: How gradient steps are made; chosen by the device if not given.
         demonstrations: Folder of `clothbus collect`.
         hung_secs: An actor that gets nowhere for so long loses its ticket to another one.
         zenoh: Zenoh settings, each key/path=value.
@@ -191,8 +196,8 @@ def learner(
         chosen = load_preset(preset, settings)
         _refuse_unsupported(chosen)
         run_folder = prepare_run_folder(folder, chosen)
-    chosen = run_folder.read_preset()
-    run_learner(run_folder, chosen, connect, device, demonstrations, hung_secs, zenoh)
+    chosen, compute = run_folder.read_preset(), Compute(device, training_path)
+    run_learner(run_folder, chosen, connect, compute, demonstrations, hung_secs, zenoh)
 
 
 @app.command(name="actor")

@@ -18,6 +18,7 @@ from deploy.priority import Priority
 from deploy.process import interrupt, on_terminate, take_when_free, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from deploy.status import only_run
+from learner.compute import ON_CPU, Compute
 
 _log = logging.getLogger(__name__)
 
@@ -60,7 +61,7 @@ def run_learner(
     folder: RunFolder,
     preset: Preset,
     address: str,
-    device: str = "cpu",
+    compute: Compute = ON_CPU,
     demonstrations: Path | None = None,
     hung_secs: float = HUNG_SECS,
     overrides: tuple[str, ...] = (),
@@ -100,7 +101,7 @@ def run_learner(
 
         loop = LearningLoop(
             owner,
-            Trainer(preset, device, pulse.beat),
+            Trainer(preset, compute, pulse.beat),
             CheckpointStore(folder.checkpoints),
             snapshots,
             read_demonstrations(demonstrations) if demonstrations else (),

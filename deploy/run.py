@@ -39,6 +39,7 @@ from deploy.topology import (
     router_process,
 )
 from deploy.vital_signs import VitalSigns
+from learner.compute import ON_CPU, Compute
 
 ROUTER_START_SECS = 30.0
 LEAVE_SECS = 10.0
@@ -53,7 +54,7 @@ class RunOptions:
     """How a run is carried out; nothing here changes what is learned."""
 
     actors: int
-    device: str = "cpu"
+    compute: Compute = ON_CPU
     address: str | None = None
     """Of a router that runs already; None starts one."""
     demonstrations: Path | None = None
@@ -88,11 +89,15 @@ def run_over_bus(folder: RunFolder, preset: Preset, options: RunOptions, console
         if options.record and lacks_recording(folder):
             _supervise(folder, replace(options, actors=0, evaluate=0), progress)
 
-    return conduct(folder, preset, console, carry_out)
+    return conduct(folder, preset, options.compute, console, carry_out)
 
 
 def conduct(
-    folder: RunFolder, preset: Preset, console: Console, carry_out: Callable[[Progress], None]
+    folder: RunFolder,
+    preset: Preset,
+    compute: Compute,
+    console: Console,
+    carry_out: Callable[[Progress], None],
 ) -> bool:
     """Carries out a run with progress, until it ends or is stopped, and says how it went.
 
@@ -101,6 +106,7 @@ def conduct(
     """
     began_secs = time.monotonic()
     console.print(f"Run folder: {folder.path}", highlight=False, soft_wrap=True)
+    console.print(f"Training: {compute}", highlight=False)
     on_terminate(interrupt)
     with take_when_free(lambda: FileLock(folder.path / "run.lock", f"run {folder.path}")):
         with Progress(preset, console) as progress, suppress(KeyboardInterrupt):
@@ -141,7 +147,7 @@ def _start_learner(
         learner_process(
             folder.path,
             address,
-            options.device,
+            options.compute,
             options.demonstrations,
             options.hung_secs,
             options.overrides,

@@ -43,7 +43,7 @@ def run_in_process(
         else:
             _play(folder, preset, options, progress)
 
-    return conduct(folder, preset, console, carry_out)
+    return conduct(folder, preset, options.compute, console, carry_out)
 
 
 def _play(folder: RunFolder, preset: Preset, options: RunOptions, progress: Progress) -> None:
@@ -60,7 +60,7 @@ def _play(folder: RunFolder, preset: Preset, options: RunOptions, progress: Prog
         snapshots = SnapshotStore(folder.snapshots)
         loop = LearningLoop(
             owner,
-            Trainer(preset, options.device),
+            Trainer(preset, options.compute),
             CheckpointStore(folder.checkpoints),
             snapshots,
             read_demonstrations(options.demonstrations) if options.demonstrations else (),

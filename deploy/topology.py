@@ -9,6 +9,7 @@ from pathlib import Path
 from broker_config.heart import HUNG_SECS
 from broker_config.messages import Role
 from deploy.priority import Priority
+from learner.compute import ON_CPU, Compute
 
 RECORDER = "recorder"
 """Under which name a run's own recorder is there."""
@@ -41,14 +42,15 @@ def router_process(address_file: Path, overrides: tuple[str, ...] = ()) -> Proce
 def learner_process(
     folder: Path,
     address: str,
-    device: str = "cpu",
+    compute: Compute = ON_CPU,
     demonstrations: Path | None = None,
     hung_secs: float = HUNG_SECS,
     overrides: tuple[str, ...] = (),
 ) -> ProcessSpec:
     """The learner of a run folder."""
     given = ("--demonstrations", str(demonstrations)) if demonstrations else ()
-    arguments = ("learner", str(folder), "--connect", address, "--device", device, *given)
+    arguments = ("learner", str(folder), "--connect", address, "--device", compute.device, *given)
+    arguments += ("--training-path", compute.path) if compute.path else ()
     arguments += ("--hung-secs", str(hung_secs))
     return ProcessSpec("owner", "learner", (*arguments, *_zenoh(overrides)))
 

@@ -20,13 +20,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from actors.networks import build_network, weights_to_bytes
+from actors.networks import PreferenceNetwork, build_network, weights_to_bytes
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import Preset
+from learner.compute import ON_CPU, Compute, TrainingPath
 from learner.cuda_graph import GraphedSteps, exact_float32
 from learner.gradient_steps import EagerSteps, GradientSteps
 from learner.memory import LocalMemory
-from learner.optimiser import build_optimiser, named_state, overwrite
+from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
+from learner.product_steps import ProductSteps
 from learner.teaching_signal import (
     bellman_error,
     bellman_target,
@@ -105,13 +107,16 @@ class Trainer:
     """
 
     def __init__(
-        self, preset: Preset, device: str = "cpu", on_step: Callable[[], None] = lambda: None
+        self,
+        preset: Preset,
+        compute: Compute = ON_CPU,
+        on_step: Callable[[], None] = lambda: None,
     ) -> None:
         """Makes the untrained policy.
 
         Args:
             preset: What is learned, and how.
-            device: Where: cpu, cuda.
+            compute: Where, and by which path.
             on_step: Called every few seconds of an update, to show that it gets on.
         """
         self._preset = preset
@@ -121,15 +126,16 @@ class Trainer:
             preset.network,
             _derived_seed(preset.seed, _WEIGHTS_STREAM),
             starts_at_zero_value=algorithm.method != "dqn",
-        ).to(device)
+        ).to(compute.device)
         self._optimiser = build_optimiser(preset.optimiser, self._network)
-        self._memory = LocalMemory(schedule.memory_samples, preset.task.observation_shape, device)
+        self._memory = LocalMemory(
+            schedule.memory_samples, preset.task.observation_shape, compute.device
+        )
         self._shuffling = torch.Generator().manual_seed(
             _derived_seed(preset.seed, _SHUFFLING_STREAM)
         )
         self._counters = _Counters()
-        steps = GraphedSteps if self._memory.device.type == "cuda" else EagerSteps
-        self._steps: GradientSteps = steps(self._network, self._optimiser, self._memory)
+        self._steps = _make_steps(compute.chosen_path, self._network, self._optimiser, self._memory)
 
     @property
     def memory(self) -> LocalMemory:
@@ -340,6 +346,17 @@ class Trainer:
         assert exploration is not None  # the preset refuses DQN without it
         per_update = 1 if schedule.update_every == "episode" else schedule.episodes_per_iteration
         return exploration.epsilon((self._counters.updates + 1) * per_update)
+
+
+def _make_steps(
+    path: TrainingPath, network: PreferenceNetwork, optimiser: FusedAdam, memory: LocalMemory
+) -> GradientSteps:
+    if path == "graphs":
+        return GraphedSteps(network, optimiser, memory)
+    if path == "reference":
+        return EagerSteps(network, optimiser, memory)
+    dtype = torch.bfloat16 if path == "products-bf16" else torch.float32
+    return ProductSteps(network, optimiser, memory, dtype)
 
 
 def _derived_seed(seed: int, stream: int) -> int:

@@ -21,6 +21,7 @@ from deploy.presets import load_preset
 from deploy.process import end_with_parent
 from deploy.reproduce.learning_curve import CurvePoint, InProcessRun
 from learner.checkpoint import CheckpointStore
+from learner.compute import Compute
 
 Method = Literal["dpn", "dueling-dpn", "dqn", "dueling-dqn"]
 Device = Literal["cpu", "cuda"]
@@ -134,7 +135,7 @@ def _run_side_by_side(
 
 def _run(key: RunKey, preset: Preset, folder: Path, device: Device, iterations: int) -> FinishedRun:
     torch.set_num_threads(1)
-    run = InProcessRun(preset, CheckpointStore(folder), device)
+    run = InProcessRun(preset, CheckpointStore(folder), Compute(device))
     for point in run.finish(iterations):
         line = (
             f"{key.name}: iteration {point.iteration}, greedy {point.greedy_return:.2f}, "

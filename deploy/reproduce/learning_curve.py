@@ -17,6 +17,7 @@ from broker_config.messages import TrajectoryId
 from broker_config.preset import Preset
 from broker_config.structure import from_plain, to_plain
 from learner.checkpoint import CheckpointStore
+from learner.compute import ON_CPU, Compute
 from learner.tickets import make_ticket
 from learner.trainer import Trainer, UpdateReport
 
@@ -56,7 +57,9 @@ class InProcessRun:
     since nothing is collected side by side.
     """
 
-    def __init__(self, preset: Preset, checkpoints: CheckpointStore, device: str = "cpu") -> None:
+    def __init__(
+        self, preset: Preset, checkpoints: CheckpointStore, compute: Compute = ON_CPU
+    ) -> None:
         if preset.schedule.policy_lag != 0:
             raise ValueError(
                 f"{preset.name}: expected schedule.policy_lag 0; got {preset.schedule.policy_lag}; "
@@ -64,7 +67,7 @@ class InProcessRun:
             )
         self._preset = preset
         self._checkpoints = checkpoints
-        self._trainer = Trainer(preset, device)
+        self._trainer = Trainer(preset, compute)
         self.points: list[CurvePoint] = []
         if (checkpoint := checkpoints.latest()) is not None:
             self._trainer.set_state(checkpoint.state)
