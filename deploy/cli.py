@@ -24,6 +24,7 @@ from deploy.process import (
     log_to_stderr,
     unfinished_exit,
 )
+from deploy.reproduce.command import reproduce
 from learner.compute import Compute, TrainingPath
 
 SHORTEST_HUNG_SECS = 10.0
@@ -425,6 +426,7 @@ app.command(name="reach")(task_commands.reach)
 app.command(name="watch")(task_commands.watch)
 app.command(name="spread")(task_commands.spread)
 app.command(name="states")(task_commands.states)
+app.command(name="reproduce")(reproduce)
 
 
 def _require_evaluable(episodes: int, in_process: bool) -> None:

@@ -26,6 +26,7 @@ from broker_config.messages import (
 )
 from learner.checkpoint import CheckpointStore
 from learner.owner import Owner
+from learner.recorded import first_samples
 from learner.snapshots import SnapshotStore
 from learner.trainer import Trainer, UpdateReport
 
@@ -161,13 +162,8 @@ class LearningLoop:
             )
         if self._demonstrations:
             self._owner.keep_demonstrations(self._demonstrations)
-        left = wanted.demonstration_samples
-        for item in kept:
-            steps = min(left, item.steps)
-            self._add(item, steps)
-            left -= steps
-            if left == 0:
-                break
+        for item in first_samples(kept, wanted.demonstration_samples):
+            self._add(item)
         self._report = self._trainer.initialise()
 
     # One step ---------------------------------------------------------------------------------
@@ -176,7 +172,7 @@ class LearningLoop:
         index = self._absorbed
         parts = self._owner.trajectories(index)
         for part in parts:
-            self._add(part, part.steps)
+            self._add(part)
         outcome = self._outcomes[index] = _outcome_of(parts)
         self._absorbed += 1
         return EpisodeAbsorbed(
@@ -188,12 +184,12 @@ class LearningLoop:
             policy_lag=self._version - parts[0].ticket.policy_version,
         )
 
-    def _add(self, trajectory: Trajectory, steps: int) -> None:
+    def _add(self, trajectory: Trajectory) -> None:
         self._trainer.add(
-            trajectory.observations[: steps + 1],
-            trajectory.actions[:steps],
-            trajectory.rewards[:steps],
-            terminated=trajectory.terminated and steps == trajectory.steps,
+            trajectory.observations,
+            trajectory.actions,
+            trajectory.rewards,
+            terminated=trajectory.terminated,
         )
 
     # After a step -----------------------------------------------------------------------------

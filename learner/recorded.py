@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from broker_config.codec import decode
@@ -38,3 +39,25 @@ def read_demonstrations(folder: Path) -> list[Trajectory]:
     """
     with JournalReader(folder / JOURNAL_FILE) as journal:
         return list(accepted_trajectories(journal))
+
+
+def first_samples(trajectories: Iterable[Trajectory], samples: int) -> Iterator[Trajectory]:
+    """The trajectories that hold the first so many samples; the last of them is cut to fit."""
+    left = samples
+    for each in trajectories:
+        if left <= 0:
+            return
+        yield each if each.steps <= left else beginning(each, left)
+        left -= each.steps
+
+
+def beginning(trajectory: Trajectory, steps: int) -> Trajectory:
+    """The first steps of a trajectory, which then ends without having terminated."""
+    return replace(
+        trajectory,
+        observations=trajectory.observations[: steps + 1],
+        actions=trajectory.actions[:steps],
+        rewards=trajectory.rewards[:steps],
+        terminated=False,
+        truncated=True,
+    )

@@ -29,6 +29,7 @@ from learner.gradient_steps import EagerSteps, GradientSteps
 from learner.memory import LocalMemory
 from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
 from learner.product_steps import ProductSteps
+from learner.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.teaching_signal import (
     bellman_error,
     bellman_target,
@@ -43,8 +44,6 @@ _EVALUATED_AT_ONCE = 128
 """Pictures for which preferences are computed at a time."""
 _STEPS_AT_ONCE = 256
 """Gradient steps between two calls of `on_step`."""
-_WEIGHTS_STREAM, _SHUFFLING_STREAM = 0, 1
-"""Independent random numbers of one preset seed."""
 
 
 @dataclass(frozen=True)
@@ -124,16 +123,14 @@ class Trainer:
         algorithm, schedule = preset.algorithm, preset.schedule
         self._network = build_network(
             preset.network,
-            _derived_seed(preset.seed, _WEIGHTS_STREAM),
+            stream_seed(preset.seed, WEIGHTS_STREAM),
             starts_at_zero_value=algorithm.method != "dqn",
         ).to(compute.device)
         self._optimiser = build_optimiser(preset.optimiser, self._network)
         self._memory = LocalMemory(
             schedule.memory_samples, preset.task.observation_shape, compute.device
         )
-        self._shuffling = torch.Generator().manual_seed(
-            _derived_seed(preset.seed, _SHUFFLING_STREAM)
-        )
+        self._shuffling = torch.Generator().manual_seed(stream_seed(preset.seed, SHUFFLING_STREAM))
         self._counters = _Counters()
         self._steps = _make_steps(compute.chosen_path, self._network, self._optimiser, self._memory)
 
@@ -357,8 +354,3 @@ def _make_steps(
         return EagerSteps(network, optimiser, memory)
     dtype = torch.bfloat16 if path == "products-bf16" else torch.float32
     return ProductSteps(network, optimiser, memory, dtype)
-
-
-def _derived_seed(seed: int, stream: int) -> int:
-    sequence = np.random.SeedSequence(seed, spawn_key=(stream,))
-    return int(sequence.generate_state(1, np.uint64)[0])

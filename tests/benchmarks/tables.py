@@ -175,6 +175,47 @@ def engine_comparison(lines: Sequence[Line]) -> str:
     return table(head, rows) + made_by(lines, f"Medians of {it['episodes']} episodes")
 
 
+def gradient_steps(lines: Sequence[Line]) -> str:
+    """Steps a second by minibatch and candidate, of the newest line of each processor."""
+    newest = {it["processor"]: it for it in lines}
+    return "\n\n".join(_gradient_steps_on(it) for it in newest.values())
+
+
+def _gradient_steps_on(it: Line) -> str:
+    peaks, rows = it["peak_gflop_per_sec"], []
+    for batch, candidates in it["found"].items():
+        rates = {
+            name: sorted(found["steps_per_sec"] for found in results)
+            for name, results in candidates.items()
+            if results[0]
+        }
+        slowest = _median(rates["Algorithm 1 as written"])
+        for name, each in rates.items():
+            peak = peaks["bfloat16" if name.endswith("bf16") else "float32"]
+            gflop = _median(each) * int(batch) * it["gflop_per_sample"]
+            rows.append(
+                [
+                    batch, name, f"{_median(each):.1f}", f"{each[0]:.1f} to {each[-1]:.1f}",
+                    f"{_median(each) / slowest:.2f}", f"{100 * gflop / peak:.0f} %",
+                    f"{max(found['peak_mib'] for found in candidates[name]):.0f}",
+                ]
+            )  # fmt: skip
+    head = [
+        "minibatch", "who", "steps a second, median", "least to most", "over as written",
+        "of the peak", "peak MiB",
+    ]  # fmt: skip
+    n_rounds = len(next(iter(it["found"]["32"].values())))
+    form = (
+        f"{it['processor']}: products of at best {peaks['float32']:.0f} (float32) and "
+        f"{peaks['bfloat16']:.0f} (bfloat16) GFLOP/s; {n_rounds} rounds"
+    )
+    return table(head, rows) + made_by([it], form)
+
+
+def _median(ordered: Sequence[float]) -> float:
+    return ordered[len(ordered) // 2]
+
+
 PAGES: dict[Path, dict[str, Callable[[Sequence[Line]], str]]] = {
     Path("docs/delivery.md"): {
         "losses": losses,
@@ -188,6 +229,7 @@ PAGES: dict[Path, dict[str, Callable[[Sequence[Line]], str]]] = {
         "cloth_blow_ups": cloth_blow_ups,
         "engine_comparison": engine_comparison,
     },
+    Path("docs/learner.md"): {"gradient_steps": gradient_steps},
 }
 
 

@@ -1,8 +1,16 @@
 import math
 
+import numpy as np
 import pytest
 
-from deploy.reproduce.paired import area_under_curve, paired_difference, student_t_quantile
+from deploy.reproduce.statistics import (
+    area_under_curve,
+    bootstrap_band,
+    bootstrap_interval,
+    interquartile_mean,
+    paired_difference,
+    student_t_quantile,
+)
 
 
 def test_area_is_a_mean_return() -> None:
@@ -55,3 +63,18 @@ def test_refuses_unpaired_seeds() -> None:
         paired_difference([1.0, 2.0], [1.0])
     with pytest.raises(ValueError, match="got 0, 0"):
         paired_difference([], [])
+
+
+def test_the_interquartile_mean_leaves_out_the_outer_quarters() -> None:
+    values = np.array([[100.0, 1.0], [2.0, 2.0], [3.0, 3.0], [-50.0, 4.0]])
+    assert interquartile_mean(values).tolist() == [2.5, 2.5]
+    assert interquartile_mean(values[:3]).tolist() == [35.0, 2.0]  # too few to leave any out
+
+
+def test_the_band_is_around_the_interquartile_mean() -> None:
+    curves = np.random.default_rng(0).normal((0.0, 10.0, 20.0), size=(12, 3))
+    low, high = bootstrap_band(curves)
+    assert (low < interquartile_mean(curves)).all()
+    assert (interquartile_mean(curves) < high).all()
+    assert (high - low < 3.0).all()
+    assert bootstrap_interval(np.array([2.0])) == (2.0, 2.0)

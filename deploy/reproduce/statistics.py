@@ -1,4 +1,4 @@
-"""Statistics of paired seeds: the mean difference, and intervals around it."""
+"""Statistics of seeds: middles, paired differences, and intervals around them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 _BOOTSTRAP_DRAWS = 100_000
+_BAND_DRAWS = 2_000
+"""For each point of a curve: a figure shows no third digit."""
 _INTEGRATION_INTERVALS = 4000
 
 
@@ -56,17 +58,61 @@ def paired_difference(
     return PairedDifference(
         differences=tuple(differences.tolist()),
         mean=float(differences.mean()),
-        bootstrap=_bootstrap_interval(differences, confidence),
+        bootstrap=bootstrap_interval(differences, confidence),
         t=_t_interval(differences, confidence) if len(differences) > 1 else None,
     )
 
 
-def _bootstrap_interval(differences: NDArray[np.float64], confidence: float) -> tuple[float, float]:
+def interquartile_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over the middle half of the seeds; with fewer than four, over all.
+
+    Args:
+        values: f64[seeds, ...].
+    """
+    cut = len(values) // 4
+    ordered = np.sort(values, axis=0)
+    return np.asarray(ordered[cut : len(values) - cut].mean(axis=0))
+
+
+def bootstrap_interval(
+    values: NDArray[np.float64], confidence: float = 0.95
+) -> tuple[float, float]:
+    """Percentile interval of the mean over resampled seeds; of one seed, that seed.
+
+    Args:
+        values: f64[seeds].
+        confidence: Portion of the means that lie inside.
+    """
     generator = np.random.default_rng(0)  # the interval is part of a document: always the same
-    draws = generator.choice(differences, (_BOOTSTRAP_DRAWS, len(differences))).mean(1)
-    tail = (1.0 - confidence) / 2.0
-    low, high = np.quantile(draws, (tail, 1.0 - tail))
+    means = generator.choice(values, (_BOOTSTRAP_DRAWS, len(values))).mean(1)
+    low, high = _quantiles(means, confidence)
     return float(low), float(high)
+
+
+def bootstrap_band(
+    curves: NDArray[np.float64], confidence: float = 0.95
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The same of the interquartile mean at each point of the curves.
+
+    Args:
+        curves: f64[seeds, points].
+        confidence: Portion of the interquartile means that lie inside.
+
+    Returns:
+        Lower and upper bound, f64[points] each.
+    """
+    picks = np.random.default_rng(0).integers(len(curves), size=(len(curves), _BAND_DRAWS))
+    middles = [interquartile_mean(column[picks]) for column in curves.T]
+    low, high = _quantiles(np.array(middles).T, confidence)
+    return low, high
+
+
+def _quantiles(
+    draws: NDArray[np.float64], confidence: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    tail = (1.0 - confidence) / 2.0
+    low, high = np.quantile(draws, (tail, 1.0 - tail), axis=0)
+    return low, high
 
 
 def _t_interval(differences: NDArray[np.float64], confidence: float) -> tuple[float, float]:

@@ -1,0 +1,71 @@
+"""`clothbus reproduce`: an experiment's missing runs, its figure and its page, by one command."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from deploy.reproduce.experiment import Experiment, with_changes
+from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs
+from learner.compute import Compute, TrainingPath
+
+CURVES, FIGURE, PAGE = "curves.jsonl", "curves.png", "README.md"
+
+
+def reproduce(
+    name: Annotated[str, tyro.conf.Positional],
+    /,
+    seeds: int | None = None,
+    iterations: int | None = None,
+    jobs: int = 1,
+    settings: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = (),
+    device: str = "cpu",
+    training_path: TrainingPath | None = None,
+    output: Path | None = None,
+    work: Path = Path("runs/reproduce"),
+    draw_only: bool = False,
+) -> None:
+    """Reproduce a figure of the source: run what is missing, go on with what was stopped, draw.
+
+    Args:
+        name: An experiment; an unknown name lists them.
+        seeds: Of each condition; the experiment's own number if not given.
+        iterations: How far runs are followed; they go on when it is more next time.
+        jobs: Runs at a time, each in a process of its own with one thread.
+        settings: Settings that replace the experiment's: schedule.epochs=2.
+        device: Where the learners compute: cpu, cuda.
+        training_path: How gradient steps are made; chosen by the device if not given.
+        output: Folder of numbers, figure and page; docs/NAME if not given.
+        work: Folder of checkpoints, demonstrations and last policies.
+        draw_only: Draw what is finished, and run nothing.
+    """
+    from deploy.reproduce.catalogue import find_experiment
+
+    experiment = with_changes(find_experiment(name), seeds, settings)
+    folder = Path("docs") / name if output is None else output
+    plans, curves = list(experiment.plans()), folder / CURVES
+    if draw_only:
+        runs = finished_runs(plans, curves)
+    else:
+        compute = Compute(device, training_path)
+        sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
+        runs = finish_runs(plans, curves, work / name, compute, jobs, iterations)
+    told = [argument for argument in sys.argv[2:] if argument != "--draw-only"]
+    command = shlex.join(["clothbus", "reproduce", *told])
+    draw(experiment, runs, folder, command)
+
+
+def draw(experiment: Experiment, runs: list[FinishedRun], folder: Path, command: str) -> None:
+    """Draws the figure and writes the page of the runs that are finished."""
+    # Imported here: the runs themselves need no matplotlib.
+    from deploy.reproduce.report import draw_figure, sort_runs, write_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    panels = sort_runs(experiment, runs)
+    draw_figure(folder / FIGURE, experiment, panels)
+    write_page(folder / PAGE, experiment, panels, command, FIGURE)
+    sys.stderr.write(f"{folder / PAGE}: {len(runs)} runs\n")

@@ -1,0 +1,104 @@
+"""What an experiment is: conditions that are compared on the same seeds, panel by panel."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from broker_config.preset import Preset
+from deploy.presets import load_preset
+from deploy.reproduce.runs import RunKey, RunPlan
+
+Start = Literal["untrained", "initialised", "cloned"]
+"""How a run begins: with the untrained policy, by Algorithm 2 from demonstrations, or by supervised
+learning of demonstrations, which is all that is learned then."""
+
+Measure = Literal["greedy_returns", "greedy_successes", "relative_bellman_errors"]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One line of a figure."""
+
+    name: str
+    """Short, for files."""
+    label: str
+    colour: str
+    overrides: tuple[str, ...]
+    """Settings that replace the preset's."""
+    start: Start = "untrained"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Conditions that are compared with each other: one figure's axes and one table."""
+
+    title: str
+    conditions: tuple[Condition, ...]
+    """The first is compared with each of the others."""
+    seeds: int
+    """Seeds 0, 1, ... are given to every condition."""
+    overrides: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A figure of the source, or one beside it."""
+
+    name: str
+    title: str
+    source: str
+    """What of the source it reproduces."""
+    published: str
+    """What the source says came out."""
+    preset: str
+    panels: tuple[Panel, ...]
+    overrides: tuple[str, ...] = ()
+    measures: tuple[Measure, ...] = ("greedy_returns",)
+    """Each is a row of the figure; areas are taken under the first."""
+    episodes: int = 1
+    """Of the greedy policy after each update; 1 is exact where task and start are deterministic."""
+    mistake_rate: float = 0.0
+    """Share of the demonstrator's actions that are random."""
+    notes: tuple[str, ...] = ()
+    """What a reader must know of the settings."""
+
+    def preset_of(self, panel: Panel, condition: Condition, seed: int) -> Preset:
+        """The preset of one run.
+
+        Raises:
+            PresetError: There is no such preset, or an override cannot be used.
+        """
+        overrides = (*self.overrides, *panel.overrides, *condition.overrides, f"seed={seed}")
+        preset = load_preset(self.preset, overrides)
+        if condition.start == "untrained":
+            return dataclasses.replace(preset, initialisation=None)
+        return preset
+
+    def plan(self, panel: Panel, condition: Condition, seed: int) -> RunPlan:
+        """All that determines one run."""
+        preset = self.preset_of(panel, condition, seed)
+        rate = None if condition.start == "untrained" else self.mistake_rate
+        key = RunKey(condition.name, seed, preset.digest, condition.start, rate, self.episodes)
+        return RunPlan(key, preset)
+
+    def plans(self) -> Iterator[RunPlan]:
+        """All runs, seed by seed: what is finished first can be compared first."""
+        for seed in range(max(panel.seeds for panel in self.panels)):
+            for panel in self.panels:
+                if seed < panel.seeds:
+                    for condition in panel.conditions:
+                        yield self.plan(panel, condition, seed)
+
+
+def with_changes(experiment: Experiment, seeds: int | None, overrides: Sequence[str]) -> Experiment:
+    """The experiment with fewer or more seeds, or with other settings."""
+    panels = [
+        dataclasses.replace(panel, seeds=panel.seeds if seeds is None else seeds)
+        for panel in experiment.panels
+    ]
+    return dataclasses.replace(
+        experiment, panels=tuple(panels), overrides=(*experiment.overrides, *overrides)
+    )

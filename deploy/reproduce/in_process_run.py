@@ -1,0 +1,241 @@
+"""One run in one process: collect, update, and the greedy policy's score after each update."""
+
+from __future__ import annotations
+
+import fcntl
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from actors.acting import collecting_policy
+from actors.envs import ClothbusEnv
+from actors.networks import weights_to_bytes
+from actors.policy import Policy
+from actors.rollout import ActingPolicy, collect
+from actors.task import make_task_env
+from broker_config.closing import Closing
+from broker_config.durable import write_durably
+from broker_config.errors import StorageError
+from broker_config.messages import Trajectory, TrajectoryId
+from broker_config.structure import from_plain, to_plain
+from deploy.collect import collect_demonstrations
+from deploy.player import GUARDED_ATTEMPTS, Player
+from deploy.reproduce.runs import CurvePoint, RunPlan
+from learner.checkpoint import CheckpointStore
+from learner.cloning import Cloned, clone, cloning_preset
+from learner.compute import ON_CPU, Compute
+from learner.recorded import first_samples
+from learner.tickets import make_ticket
+from learner.trainer import Trainer, UpdateReport
+
+
+class InProcessRun(Closing):
+    """A run whose episodes are those that tickets over the bus would ask for.
+
+    It checkpoints after every iteration, and goes on from there when it is made again. Tasks are
+    deterministic given the ticket, and policies trail by the preset's lag: a lag is refused here,
+    since nothing is collected side by side.
+
+    Attributes:
+        points: What was reached so far.
+    """
+
+    def __init__(self, plan: RunPlan, work: Path, compute: Compute = ON_CPU) -> None:
+        """Begins, or goes on.
+
+        Args:
+            plan: Of the run.
+            work: Folder for its checkpoints, and for demonstrations.
+            compute: What it is trained on.
+
+        Raises:
+            ValueError: The preset has a policy lag.
+        """
+        preset = plan.preset
+        if preset.schedule.policy_lag != 0:
+            raise ValueError(
+                f"{preset.name}: expected schedule.policy_lag 0; got {preset.schedule.policy_lag}; "
+                "one process collects and trains in turn"
+            )
+        self._plan, self._preset, self._work = plan, preset, work
+        self._env: ClothbusEnv | None = None
+        self._player: Player | None = None
+        self._trainer = Trainer(preset, compute)
+        self._checkpoints = CheckpointStore(self.checkpoints_folder)
+        self._policy: Policy | None = None
+        """The current one, once somebody has asked for it."""
+        self._cloned: Cloned | None = None
+        self.points: list[CurvePoint] = []
+        if (checkpoint := self._checkpoints.latest()) is not None:
+            self._trainer.set_state(checkpoint.state)
+            self.points = [
+                from_plain(point, CurvePoint, "checkpoint.points")
+                for point in checkpoint.extra["points"]
+            ]
+
+    def close(self) -> None:
+        """Ends the environments."""
+        for each in (self._env, self._player):
+            if each is not None:
+                each.close()
+        self._env = self._player = None
+
+    @property
+    def checkpoints_folder(self) -> Path:
+        """May be removed once the run has been followed to its end."""
+        return self._work / "checkpoints" / self._plan.key.name
+
+    def keep_policy(self) -> Path:
+        """Stores the newest policy's weights beside the checkpoints; returns the file."""
+        path = policy_file(self._work, self._plan)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        weights = self._trainer.weights() if self._cloned is None else self._cloned.weights
+        write_durably(path, weights_to_bytes(weights))
+        return path
+
+    def finish(self, iterations: int | None = None) -> Iterator[CurvePoint]:
+        """Runs what is left of so many iterations, or of all; yields each once it is on disk.
+
+        Raises:
+            StorageError: No seed gives a sound episode, or the disk refuses.
+        """
+        last = self._preset.schedule.iterations if iterations is None else iterations
+        while not self.points or self.points[-1].iteration < last:
+            self.points.append(self._iterate() if self.points else self._begin())
+            if self._cloned is None:  # cloning is short, and no trainer's state
+                extra = {"points": [to_plain(point) for point in self.points]}
+                self._checkpoints.save(self._trainer.get_state(), extra)
+            yield self.points[-1]
+
+    def _begin(self) -> CurvePoint:
+        """Iteration 0: the untrained, the initialised or the cloned policy."""
+        began_secs = time.perf_counter()
+        demonstrations = self._demonstrations()
+        report: UpdateReport | None = None
+        loss, gradient_steps = None, 0
+        if self._plan.key.start == "initialised":
+            for each in demonstrations:
+                self._add(each)
+            report = self._trainer.initialise()
+            loss, gradient_steps = report.loss, report.gradient_steps
+        if self._plan.key.start == "cloned":
+            wanted = self._preset.initialisation
+            assert wanted is not None  # or there were no demonstrations
+            epochs = wanted.target_switches * self._preset.schedule.epochs
+            self._cloned = clone(self._preset, demonstrations, epochs)
+            loss, gradient_steps = self._cloned.loss, self._cloned.gradient_steps
+        greedy_return, success = self._score()
+        returns = [each.return_ for each in demonstrations]
+        return CurvePoint(
+            iteration=0,
+            samples=0,
+            gradient_steps=gradient_steps,
+            updated_at=(0,),
+            greedy_returns=(greedy_return,),
+            greedy_successes=(success,),
+            training_return=float(np.mean(returns)) if returns else None,
+            loss=loss,
+            mean_value=report.mean_value if report else None,
+            bellman_error=report.bellman_error if report else None,
+            relative_bellman_error=report.relative_bellman_error if report else None,
+            secs=time.perf_counter() - began_secs,
+        )
+
+    def _iterate(self) -> CurvePoint:
+        began_secs = time.perf_counter()
+        schedule, n_before = self._preset.schedule, self.points[-1].iteration
+        first = n_before * schedule.episodes_per_iteration
+        returns: list[float] = []
+        updated_at: list[int] = []
+        scores: list[tuple[float, float]] = []
+        report: UpdateReport | None = None
+        for index in range(first, first + schedule.episodes_per_iteration):
+            acting = collecting_policy(self._preset.algorithm, self._current_policy())
+            played = self._collect(acting, index)
+            self._add(played)
+            returns.append(played.return_)
+            if schedule.updates_after(index):
+                report = self._trainer.update()
+                self._policy = None
+                updated_at.append((index + 1) * self._preset.task.horizon)
+                scores.append(self._score())
+        assert report is not None  # an update ends every iteration
+        return CurvePoint(
+            iteration=n_before + 1,
+            samples=(n_before + 1) * schedule.episodes_per_iteration * self._preset.task.horizon,
+            gradient_steps=self._trainer.gradient_steps,
+            updated_at=tuple(updated_at),
+            greedy_returns=tuple(return_ for return_, _ in scores),
+            greedy_successes=tuple(success for _, success in scores),
+            training_return=float(np.mean(returns)),
+            loss=report.loss,
+            mean_value=report.mean_value,
+            bellman_error=report.bellman_error,
+            relative_bellman_error=report.relative_bellman_error,
+            secs=time.perf_counter() - began_secs,
+        )
+
+    def _current_policy(self) -> Policy:
+        if self._policy is None:
+            if self._cloned is not None:
+                network = cloning_preset(self._preset).network
+                self._policy = Policy(network, self._cloned.weights)
+            else:
+                self._policy = Policy(self._preset.network, self._trainer.weights())
+        return self._policy
+
+    def _add(self, played: Trajectory) -> None:
+        self._trainer.add(
+            played.observations, played.actions, played.rewards, terminated=played.terminated
+        )
+
+    def _collect(self, policy: ActingPolicy, index: int) -> Trajectory:
+        """Plays an episode; one that the guard ends is played again on the next seed."""
+        if self._env is None:
+            self._env = make_task_env(self._preset.task)
+        id_ = TrajectoryId("in-process", "in-process", index)
+        for generation in range(GUARDED_ATTEMPTS):
+            ticket = make_ticket(self._preset, index, generation=generation)
+            played = collect(self._env, policy, ticket, id_)
+            if played.guard is None:
+                return played
+        raise StorageError(
+            f"episode {index}: expected a sound attempt with one of {GUARDED_ATTEMPTS} seeds; got "
+            f"{played.guard}; mend the task or the simulator"
+        )
+
+    def _score(self) -> tuple[float, float]:
+        """Mean return and portion of success of the greedy policy, on seeds of evaluation."""
+        if self._player is None:
+            self._player = Player(self._preset)
+        episodes = [
+            self._player.play(self._current_policy(), 0, "greedy", number)
+            for number in range(self._plan.key.episodes)
+        ]
+        return (
+            float(np.mean([each.return_ for each in episodes])),
+            float(np.mean([each.success for each in episodes])),
+        )
+
+    def _demonstrations(self) -> list[Trajectory]:
+        """Made by whoever needs them first; the same for all conditions of a seed."""
+        rate, wanted = self._plan.key.mistake_rate, self._preset.initialisation
+        if rate is None or wanted is None:
+            return []
+        # Whatever learns from them has nothing to do with how they are made.
+        neutral = replace(cloning_preset(self._preset), exploration=None, initialisation=None)
+        folder = self._work / "demonstrations" / f"{neutral.digest[:12]}-{rate:g}"
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        episodes = -(-wanted.demonstration_samples // self._preset.task.horizon)
+        with folder.with_name(f"{folder.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            played = list(collect_demonstrations(neutral, folder, episodes, "scripted", rate))
+        return list(first_samples(played, wanted.demonstration_samples))
+
+
+def policy_file(work: Path, plan: RunPlan) -> Path:
+    """Where a run's last policy is kept."""
+    return work / "policies" / f"{plan.key.name}.safetensors"

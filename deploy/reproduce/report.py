@@ -1,0 +1,281 @@
+"""The figure and the page of an experiment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
+from deploy.reproduce.runs import FinishedRun, RunKey
+from deploy.reproduce.statistics import (
+    PairedDifference,
+    area_under_curve,
+    bootstrap_band,
+    bootstrap_interval,
+    interquartile_mean,
+    paired_difference,
+)
+
+mpl.use("Agg")  # before pyplot: there is no screen
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+_AXIS_LABELS: dict[Measure, str] = {
+    "greedy_returns": "return of the greedy policy",
+    "greedy_successes": "success at the end",
+    "relative_bellman_errors": "Bellman error / std(V)",
+}
+_PANEL_INCHES = (5.2, 3.4)
+
+
+@dataclass(frozen=True)
+class PanelRuns:
+    """A panel, and those of its runs that are finished."""
+
+    panel: Panel
+    runs: dict[str, list[FinishedRun]]
+    """By condition, in the order of seeds."""
+
+    @property
+    def subject(self) -> Condition:
+        """The condition that the others are compared with."""
+        return self.panel.conditions[0]
+
+    def areas(self, condition: Condition) -> dict[int, float]:
+        """Area under the greedy curve, by seed."""
+        return {
+            run.key.seed: area_under_curve(run.samples, run.greedy_returns)
+            for run in self.runs[condition.name]
+        }
+
+    def difference(self, other: Condition) -> PairedDifference | None:
+        """The subject's areas minus the other's, over the seeds that both have finished."""
+        mine, theirs = self.areas(self.subject), self.areas(other)
+        seeds = sorted(mine.keys() & theirs.keys())
+        if not seeds:
+            return None
+        return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
+
+
+def sort_runs(experiment: Experiment, runs: Sequence[FinishedRun]) -> list[PanelRuns]:
+    """The finished runs, by panel and condition."""
+    by_key: dict[RunKey, FinishedRun] = {run.key: run for run in runs}
+    sorted_runs = []
+    for panel in experiment.panels:
+        found = {
+            condition.name: [
+                by_key[key]
+                for seed in range(panel.seeds)
+                if (key := experiment.plan(panel, condition, seed).key) in by_key
+            ]
+            for condition in panel.conditions
+        }
+        sorted_runs.append(PanelRuns(panel, found))
+    return sorted_runs
+
+
+def draw_figure(path: Path, experiment: Experiment, panels: Sequence[PanelRuns]) -> None:
+    """Draws each panel's curves over samples, a row for each measure, as a PNG."""
+    n_rows, n_columns = len(experiment.measures), len(panels)
+    width, height = _PANEL_INCHES
+    figure, grid = plt.subplots(
+        n_rows,
+        n_columns,
+        figsize=(width * n_columns, height * n_rows),
+        layout="constrained",
+        squeeze=False,
+        sharey="row",
+    )
+    for column, panel_runs in enumerate(panels):
+        for row, measure in enumerate(experiment.measures):
+            axes = grid[row][column]
+            _draw_panel(axes, panel_runs, measure)
+            axes.set(
+                title=panel_runs.panel.title if row == 0 else "",
+                xlabel="samples" if row == n_rows - 1 else "",
+                ylabel=_AXIS_LABELS[measure] if column == 0 else "",
+            )
+            axes.grid(alpha=0.3)
+            if row == 0:
+                axes.legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
+    demonstrated: list[float] = []
+    for condition in panel_runs.panel.conditions:
+        runs = panel_runs.runs[condition.name]
+        if not runs:
+            continue
+        demonstrated += [
+            first.training_return
+            for run in runs
+            if (first := run.points[0]).iteration == 0 and first.training_return is not None
+        ]
+        samples, curves = _curves(runs, measure)
+        if not samples:
+            continue  # what was cloned has no value function
+        middle = interquartile_mean(curves)
+        low, high = bootstrap_band(curves)
+        label = f"{condition.label} ({len(runs)})"
+        if condition.start == "cloned":
+            axes.axhline(middle[0], color=condition.colour, linestyle=":", label=label)
+            axes.axhspan(low[0], high[0], color=condition.colour, alpha=0.1)
+            continue
+        style = "--" if condition.start == "initialised" else "-"
+        axes.plot(samples, middle, style, color=condition.colour, label=label, linewidth=1.5)
+        axes.fill_between(samples, low, high, color=condition.colour, alpha=0.15, linewidth=0)
+    if measure == "greedy_returns" and demonstrated:
+        axes.axhline(
+            float(np.mean(demonstrated)), color="purple", linestyle="-.", linewidth=1,
+            label="demonstrations",
+        )  # fmt: skip
+
+
+def _curves(runs: Sequence[FinishedRun], measure: Measure) -> tuple[list[int], np.ndarray]:
+    """Where the measure was taken, and its values f64[seeds, points]."""
+    if measure == "relative_bellman_errors":
+        points = [[it for it in run.points if it.iteration > 0] for run in runs]
+        values = [[it.relative_bellman_error or np.nan for it in each] for each in points]
+        return [it.samples for it in points[0]], np.array(values)
+    curves = [getattr(run, measure) for run in runs]
+    return runs[0].samples, np.array(curves, dtype=np.float64)
+
+
+def write_page(
+    path: Path, experiment: Experiment, panels: Sequence[PanelRuns], command: str, figure_name: str
+) -> None:
+    """Writes what was published, what came out, and what it was made from, as Markdown."""
+    parts = [
+        f"# {experiment.title}",
+        f"![Curves over samples]({figure_name})",
+        f"**Published** ({experiment.source}): {experiment.published}",
+        "Lines are interquartile means over seeds, bands their 95 % bootstrap intervals; "
+        "in brackets the number of seeds. Every run's last policy counts, not its best.",
+    ]
+    for panel_runs in panels:
+        parts += [
+            f"## {panel_runs.panel.title}",
+            _conclusion(panel_runs),
+            _scores_table(experiment, panel_runs),
+            _differences_table(panel_runs),
+        ]
+    parts += [
+        "## How it was made",
+        f"```\n{command}\n```",
+        _settings(experiment, panels),
+    ]
+    path.write_text("\n\n".join(part for part in parts if part) + "\n")
+
+
+def _conclusion(panel_runs: PanelRuns) -> str:
+    sentences = []
+    for other in panel_runs.panel.conditions[1:]:
+        difference = panel_runs.difference(other)
+        if difference is None:
+            continue
+        low, high = difference.bootstrap
+        verdict = "above" if low > 0 else "below" if high < 0 else "not told apart from"
+        sentences.append(
+            f"{panel_runs.subject.label}'s area under the curve is {verdict} {other.label}'s: the "
+            f"mean paired difference is {difference.mean:+.2f}, with a 95 % interval from "
+            f"{low:+.2f} to {high:+.2f} (bootstrap over {len(difference.differences)} seeds)."
+        )
+    return "\n".join(sentences)
+
+
+def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
+    looks_at_success = "greedy_successes" in experiment.measures
+    header = ["condition", "seeds", "last return", "95 %"]
+    header += ["last success", "95 %"] if looks_at_success else []
+    header += ["area", "samples", "gradient steps", "minutes a run"]
+    rows = []
+    for condition in panel_runs.panel.conditions:
+        runs = panel_runs.runs[condition.name]
+        if not runs:
+            continue
+        cells = [condition.label, str(len(runs))]
+        cells += _mean_and_interval([run.greedy_returns[-1] for run in runs], "{:.2f}")
+        if looks_at_success:
+            cells += _mean_and_interval([run.greedy_successes[-1] for run in runs], "{:.0%}")
+        minutes = np.mean([sum(it.secs for it in run.points) for run in runs]) / 60
+        last = runs[0].points[-1]
+        cells += [
+            f"{np.mean(list(panel_runs.areas(condition).values())):.2f}",
+            str(last.samples),
+            str(last.gradient_steps),
+            f"{minutes:.1f}",
+        ]
+        rows.append(cells)
+    return _table(header, rows)
+
+
+def _mean_and_interval(values: Sequence[float], form: str) -> list[str]:
+    low, high = bootstrap_interval(np.asarray(values))
+    return [form.format(np.mean(values)), f"{form.format(low)} to {form.format(high)}"]
+
+
+def _differences_table(panel_runs: PanelRuns) -> str:
+    header = ["difference of areas", "each seed", "mean", "95 % bootstrap", "95 % Student's t"]
+    rows = []
+    for other in panel_runs.panel.conditions[1:]:
+        difference = panel_runs.difference(other)
+        if difference is None:
+            continue
+        rows.append(
+            [
+                f"{panel_runs.subject.label} - {other.label}",
+                ", ".join(f"{value:+.2f}" for value in difference.differences),
+                f"{difference.mean:+.2f}",
+                _interval(difference.bootstrap),
+                "needs two seeds" if difference.t is None else _interval(difference.t),
+            ]
+        )
+    return _table(header, rows) if rows else ""
+
+
+def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
+    panel = experiment.panels[0]
+    preset = experiment.preset_of(panel, panel.conditions[0], 0)
+    schedule, optimiser = preset.schedule, preset.optimiser
+    runs = [run for each in panels for runs in each.runs.values() for run in runs]
+    followed = max((run.iterations for run in runs), default=0)
+    made_on = " and ".join(sorted({run.compute for run in runs}))
+    lines = [
+        f"* Preset `{preset.name}` ({preset.source}): eta {preset.algorithm.eta:g}, gamma "
+        f"{preset.algorithm.gamma:g}, M {schedule.episodes_per_iteration}, T "
+        f"{preset.task.horizon}, E {schedule.memory_samples}, N {schedule.target_switches}, U "
+        f"{schedule.epochs}, minibatches of {schedule.minibatch_size}, an update every "
+        f"{schedule.update_every}, {optimiser.name} {optimiser.learning_rate:g}; "
+        f"{followed} of {schedule.iterations} iterations; {made_on}.",
+        "* The area is the mean greedy return over the samples, by trapezia from the first point "
+        f"to the last. Greedy episodes after each update: {experiment.episodes}.",
+        "* Seeds are paired: initial weights, minibatches, demonstrations and the episodes' random "
+        "numbers are derived from them. All runs are shown.",
+        *(f"* {note}" for note in experiment.notes),
+    ]
+    changes = [
+        f"`{override}`" for override in (*experiment.overrides, *experiment.panels[0].overrides)
+    ]
+    if changes:
+        lines.append(f"* Changed from the preset: {', '.join(changes)}.")
+    if any(it.start != "untrained" for each in experiment.panels for it in each.conditions):
+        lines.append(
+            f"* Demonstrations: the task's script, {experiment.mistake_rate:.0%} of its actions "
+            "random, drawn anew for each seed and the same for all conditions of it."
+        )
+    return "\n".join(lines)
+
+
+def _interval(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:+.2f} to {bounds[1]:+.2f}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,250 @@
+"""The runs of an experiment: made side by side, resumable, and kept as JSON lines."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from broker_config.durable import write_durably
+from broker_config.errors import MessageError, StorageError
+from broker_config.preset import Preset
+from broker_config.structure import from_plain, to_plain
+from deploy.process import end_with_parent, use_one_torch_thread
+from learner.compute import Compute
+
+Device = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True)
+class RunKey:
+    """Names one run of an experiment by everything that determines it."""
+
+    condition: str
+    seed: int
+    preset_digest: str
+    """Of the run's own preset, condition and seed included."""
+    start: Literal["untrained", "initialised", "cloned"]
+    mistake_rate: float | None
+    """Of the demonstrator, where there is one."""
+    episodes: int
+    """Of the greedy policy after each update."""
+
+    @property
+    def name(self) -> str:
+        """Short, and another for every setting."""
+        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()
+        return f"{self.condition}-{self.seed}-{digest[:12]}"
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """A run that is to be made."""
+
+    key: RunKey
+    preset: Preset
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The state of a run after an iteration; iteration 0 is what came before the first episode."""
+
+    iteration: int
+    samples: int
+    """Of the run; demonstrations are not counted."""
+    gradient_steps: int
+    updated_at: tuple[int, ...]
+    """Samples of the run at each update of the iteration."""
+    greedy_returns: tuple[float, ...]
+    """Mean return of the greedy policy's episodes after each of these updates, no discount."""
+    greedy_successes: tuple[float, ...]
+    """Portion of these episodes that succeeded at their end; empty where nobody looked."""
+    training_return: float | None
+    """Mean return of the iteration's episodes; of the demonstrations before the first."""
+    loss: float | None
+    mean_value: float | None
+    bellman_error: float | None
+    relative_bellman_error: float | None
+    secs: float
+    """Wall time of the iteration."""
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A learning curve and the run that it belongs to."""
+
+    key: RunKey
+    compute: str
+    """On what and by which path it was trained."""
+    points: tuple[CurvePoint, ...]
+
+    @property
+    def iterations(self) -> int:
+        """How far it was followed."""
+        return self.points[-1].iteration
+
+    @property
+    def samples(self) -> list[int]:
+        """Samples at each update."""
+        return [samples for point in self.points for samples in point.updated_at]
+
+    @property
+    def greedy_returns(self) -> list[float]:
+        """Of the policy after each update."""
+        return [value for point in self.points for value in point.greedy_returns]
+
+    @property
+    def greedy_successes(self) -> list[float]:
+        """Of the policy after each update."""
+        return [value for point in self.points for value in point.greedy_successes]
+
+
+def finish_runs(
+    plans: Sequence[RunPlan],
+    curves: Path,
+    work: Path,
+    compute: Compute,
+    jobs: int,
+    iterations: int | None,
+) -> list[FinishedRun]:
+    """Makes what the file does not hold yet, and adds each run to it when it is finished.
+
+    Args:
+        plans: The runs, in the order in which they are started.
+        curves: The file of JSON lines, one for each iteration of a finished run.
+        work: Folder of checkpoints and demonstrations: an unfinished run goes on from its last
+            iteration.
+        compute: What the learners compute on; actors act on the CPU.
+        jobs: Runs at a time, each in a process of its own with one thread.
+        iterations: How far each run is followed; the preset's if None. A run that was followed less
+            far goes on.
+
+    Returns:
+        All runs asked for, in the order of `plans`.
+
+    Raises:
+        StorageError: The file cannot be read or written.
+    """
+    finished = {run.key: run for run in read_runs(curves)}
+    wanted = {plan.key: _iterations_of(plan, iterations) for plan in plans}
+    missing = [
+        plan
+        for plan in plans
+        if plan.key not in finished or finished[plan.key].iterations < wanted[plan.key]
+    ]
+    for run in _run_side_by_side(missing, work, compute, jobs, wanted):
+        finished[run.key] = run
+        write_runs(curves, finished.values())
+    return [_up_to(finished[plan.key], wanted[plan.key]) for plan in plans]
+
+
+def finished_runs(plans: Sequence[RunPlan], curves: Path) -> list[FinishedRun]:
+    """Those of the runs that the file holds."""
+    finished = {run.key: run for run in read_runs(curves)}
+    return [finished[plan.key] for plan in plans if plan.key in finished]
+
+
+def _iterations_of(plan: RunPlan, iterations: int | None) -> int:
+    if plan.key.start == "cloned":
+        return 0
+    planned = plan.preset.schedule.iterations
+    return planned if iterations is None else min(planned, iterations)
+
+
+def _up_to(run: FinishedRun, iterations: int) -> FinishedRun:
+    return replace(run, points=tuple(it for it in run.points if it.iteration <= iterations))
+
+
+def _run_side_by_side(
+    plans: Sequence[RunPlan],
+    work: Path,
+    compute: Compute,
+    jobs: int,
+    wanted: dict[RunKey, int],
+) -> Iterator[FinishedRun]:
+    # A process for each run, and spawned: CUDA does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(
+        jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
+    ) as pool:
+        futures = [pool.submit(_run, plan, work, compute, wanted[plan.key]) for plan in plans]
+        try:
+            for number, future in enumerate(as_completed(futures), start=1):
+                sys.stderr.write(f"{number} of {len(futures)} runs finished\n")
+                yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)  # what has not begun does not begin
+            raise
+
+
+def _run(plan: RunPlan, work: Path, compute: Compute, iterations: int) -> FinishedRun:
+    from deploy.reproduce.in_process_run import InProcessRun  # the parent needs no torch
+
+    use_one_torch_thread()
+    with InProcessRun(plan, work, compute) as run:
+        for point in run.finish(iterations):
+            sys.stderr.write(f"{plan.key.name}: {_described(point)}\n")
+        finished = FinishedRun(plan.key, str(compute), tuple(run.points))
+        run.keep_policy()
+    if finished.iterations >= plan.preset.schedule.iterations:
+        shutil.rmtree(run.checkpoints_folder, ignore_errors=True)
+    return finished
+
+
+def _described(point: CurvePoint) -> str:
+    success = f", success {point.greedy_successes[-1]:.0%}" if point.greedy_successes else ""
+    return (
+        f"iteration {point.iteration}, greedy {point.greedy_returns[-1]:.2f}{success}, "
+        f"{point.gradient_steps} gradient steps, {point.secs:.1f} s"
+    )
+
+
+def read_runs(path: Path) -> list[FinishedRun]:
+    """Reads what `write_runs` wrote; no runs where there is no file.
+
+    Raises:
+        StorageError: The file holds something else.
+    """
+    if not path.exists():
+        return []
+    curves: dict[tuple[RunKey, str], list[CurvePoint]] = {}
+    for number, line in enumerate(path.read_text().splitlines(), start=1):
+        try:
+            row = from_plain(json.loads(line), _Row, f"{path.name}:{number}")
+        except (ValueError, MessageError) as error:
+            raise StorageError(
+                f"{path}: expected learning curves; got line {number}: {error}; move it away"
+            ) from error
+        curves.setdefault((row.run, row.compute), []).append(row.point)
+    return [FinishedRun(key, compute, tuple(points)) for (key, compute), points in curves.items()]
+
+
+def write_runs(path: Path, runs: Iterable[FinishedRun]) -> None:
+    """Writes the runs' curves, ordered by condition and seed; a reader sees the whole file or none.
+
+    Raises:
+        StorageError: The disk refuses.
+    """
+    ordered = sorted(runs, key=lambda run: (run.key.condition, run.key.seed, run.key.name))
+    rows = [_Row(run.key, run.compute, point) for run in ordered for point in run.points]
+    text = "".join(json.dumps(to_plain(row)) + "\n" for row in rows)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, text.encode())
+    except OSError as error:
+        raise StorageError(f"{path}: expected to write {len(rows)} lines; got {error}") from error
+
+
+@dataclass(frozen=True)
+class _Row:
+    run: RunKey
+    compute: str
+    point: CurvePoint

@@ -1,0 +1,228 @@
+"""Experiments: runs that go on where they were stopped, and pages that say what came out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from actors.policy import Policy
+from broker_config.errors import PresetError, StorageError
+from broker_config.messages import Trajectory
+from broker_config.preset import Preset
+from deploy.presets import preset_names
+from deploy.reproduce import command
+from deploy.reproduce.catalogue import (
+    DPN,
+    DQN,
+    DUELING_DPN,
+    EXPERIMENTS,
+    SUPERVISED,
+    find_experiment,
+)
+from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
+from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
+from deploy.reproduce.in_process_run import InProcessRun, policy_file
+from deploy.reproduce.runs import (
+    CurvePoint,
+    FinishedRun,
+    RunPlan,
+    finish_runs,
+    read_runs,
+    write_runs,
+)
+from learner.cloning import cloning_preset
+from learner.compute import ON_CPU
+
+torch.set_num_threads(1)  # as the runs' own processes have
+
+INITIALISED = replace(DUELING_DPN, name="dueling-dpn-init", start="initialised")
+SMOKE = Experiment(
+    name="smoke",
+    title="A short experiment",
+    source="figure 0",
+    published="It works.",
+    preset="reaching-smoke",
+    panels=(Panel("2 joints", (DPN, DQN, INITIALISED, SUPERVISED), seeds=2),),
+    overrides=("initialisation.demonstration_samples=15", "initialisation.target_switches=2"),
+    measures=("greedy_returns", "greedy_successes", "relative_bellman_errors"),
+    mistake_rate=0.25,
+)
+
+
+def smoke_plan(condition: Condition = DPN, seed: int = 0) -> RunPlan:
+    return SMOKE.plan(SMOKE.panels[0], condition, seed)
+
+
+def without_time(points: list[CurvePoint]) -> list[CurvePoint]:
+    return [replace(point, secs=0.0) for point in points]
+
+
+def run_of(condition: Condition, seed: int, returns: list[float]) -> FinishedRun:
+    points = tuple(
+        CurvePoint(i, 20 * i, 5, (20 * i,), (value,), (0.5,), value, 0.1, 0.2, 0.3, 0.4, 1.5)
+        for i, value in enumerate(returns)
+    )
+    return FinishedRun(smoke_plan(condition, seed).key, "reference steps on cpu", points)
+
+
+@pytest.mark.parametrize("condition", [DPN, DQN, INITIALISED], ids=lambda it: it.name)
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(
+    tmp_path: Path, condition: Condition
+) -> None:
+    plan = smoke_plan(condition)
+    with InProcessRun(plan, tmp_path / "whole") as whole:
+        list(whole.finish())
+    with InProcessRun(plan, tmp_path / "parts") as interrupted:
+        next(interrupted.finish())
+    with InProcessRun(plan, tmp_path / "parts") as resumed:
+        assert [point.iteration for point in resumed.points] == [0]
+        assert len(list(resumed.finish())) == plan.preset.schedule.iterations
+    assert without_time(resumed.points) == without_time(whole.points)
+
+
+def test_runs_of_another_setting_are_other_runs(tmp_path: Path) -> None:
+    changed = with_changes(SMOKE, None, ["schedule.epochs=3"])
+    other_rate = replace(SMOKE, mistake_rate=0.5)
+    names = {
+        experiment.plan(SMOKE.panels[0], condition, 0).key.name
+        for experiment in (SMOKE, changed, other_rate)
+        for condition in (INITIALISED, SUPERVISED)
+    }
+    assert len(names) == 6
+    # An untrained policy has no demonstrations to differ by.
+    untrained = {each.plan(SMOKE.panels[0], DPN, 0).key for each in (SMOKE, other_rate)}
+    assert len(untrained) == 1
+
+
+def test_what_is_finished_is_not_run_again_and_goes_on_when_more_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    plans, curves = [smoke_plan()], tmp_path / "curves.jsonl"
+    (first,) = finish_runs(plans, curves, tmp_path / "work", ON_CPU, 1, iterations=1)
+    (second,) = finish_runs(plans, curves, tmp_path / "work", ON_CPU, 1, iterations=None)
+    assert (first.iterations, second.iterations) == (1, 2)
+    assert second.points[:2] == first.points
+    (again,) = finish_runs(plans, curves, tmp_path / "nowhere", ON_CPU, 1, iterations=1)
+    assert again == first
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_conditions_get_equal_samples_and_gradient_steps(tmp_path: Path) -> None:
+    budgets = set()
+    for condition in (DPN, DQN, DUELING_DPN):
+        with InProcessRun(smoke_plan(condition), tmp_path) as run:
+            last = list(run.finish())[-1]
+        budgets.add((last.samples, last.gradient_steps))
+    assert budgets == {(40, 20)}
+
+
+def test_demonstrations_are_the_same_for_all_conditions_of_a_seed(tmp_path: Path) -> None:
+    def demonstrations(condition: Condition, seed: int) -> list[Trajectory]:
+        with InProcessRun(smoke_plan(condition, seed), tmp_path) as run:
+            return run._demonstrations()
+
+    mine, theirs = demonstrations(INITIALISED, 0), demonstrations(SUPERVISED, 0)
+    assert sum(each.steps for each in mine) == 15  # a last trajectory is cut to fit
+    assert [it.actions.tolist() for it in mine] == [it.actions.tolist() for it in theirs]
+    other = demonstrations(INITIALISED, 1)
+    assert [it.actions.tolist() for it in other] != [it.actions.tolist() for it in mine]
+    assert demonstrations(DPN, 0) == []
+
+
+def test_a_cloned_policy_does_what_was_demonstrated(tmp_path: Path) -> None:
+    """Without mistakes, and with enough epochs, in nearly all demonstrated states."""
+    experiment = replace(SMOKE, mistake_rate=0.0)
+    experiment = with_changes(experiment, 1, ["schedule.epochs=60", "optimiser.name=adam"])
+    plan = experiment.plan(SMOKE.panels[0], SUPERVISED, 0)
+    with InProcessRun(plan, tmp_path) as run:
+        (point,) = run.finish(0)
+        run.keep_policy()
+        demonstrations = run._demonstrations()
+    assert (point.iteration, point.samples) == (0, 0)
+    assert point.gradient_steps == 60 * 2
+    weights = policy_file(tmp_path, plan).read_bytes()
+    policy = Policy.from_bytes(cloning_preset(plan.preset).network, weights)
+    agrees = [
+        policy.greedy(picture) == action
+        for each in demonstrations
+        for picture, action in zip(each.observations, each.actions, strict=False)
+    ]
+    assert np.mean(agrees) > 0.8
+
+
+def test_a_policy_lag_is_refused(tmp_path: Path) -> None:
+    experiment = with_changes(SMOKE, None, ["schedule.policy_lag=1"])
+    with pytest.raises(ValueError, match=r"expected schedule\.policy_lag 0; got 1"):
+        InProcessRun(experiment.plan(SMOKE.panels[0], DPN, 0), tmp_path)
+
+
+def test_every_experiment_of_the_catalogue_can_be_planned() -> None:
+    for experiment in EXPERIMENTS.values():
+        assert experiment.preset in preset_names()
+        plans = list(experiment.plans())
+        names = {plan.key.name for plan in plans}
+        assert len(names) == len(plans), experiment.name
+        for plan in plans:
+            assert isinstance(plan.preset, Preset)
+            assert (plan.preset.initialisation is not None) == (plan.key.start != "untrained")
+
+
+def test_there_must_be_such_an_experiment() -> None:
+    with pytest.raises(PresetError, match=r"expected one of dpn-vs-dqn.*got nothing"):
+        find_experiment("nothing")
+
+
+def test_runs_survive_the_file(tmp_path: Path) -> None:
+    runs = [run_of(DQN, 0, [1.0, 2.0]), run_of(DPN, 1, [3.0]), run_of(DPN, 0, [4.0])]
+    path = tmp_path / "curves.jsonl"
+    assert read_runs(path) == []
+    write_runs(path, runs)
+    assert read_runs(path) == [runs[2], runs[1], runs[0]]
+
+
+def test_a_damaged_file_is_named_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "curves.jsonl"
+    write_runs(path, [run_of(DPN, 0, [1.0])])
+    path.write_text(path.read_text() + "{}\n")
+    with pytest.raises(StorageError, match="got line 2"):
+        read_runs(path)
+
+
+def test_one_command_leaves_numbers_figure_and_page(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deploy.reproduce import catalogue
+
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "smoke", with_changes(SMOKE, 1, ()))
+    monkeypatch.setattr(command.sys, "argv", ["clothbus", "reproduce", "smoke", "--draw-only"])
+    places = {"output": tmp_path / "docs", "work": tmp_path / "work"}
+    command.reproduce("smoke", jobs=2, **places)
+    rows = [json.loads(line) for line in (tmp_path / "docs" / CURVES).read_text().splitlines()]
+    assert len(rows) == 3 * 3 + 1  # three points of a learner, one of a clone
+    assert (tmp_path / "docs" / FIGURE).stat().st_size > 5000
+    page = (tmp_path / "docs" / PAGE).read_text()
+    assert "clothbus reproduce smoke\n" in page
+    assert "| DPN - DQN |" in page
+    assert "**Published** (figure 0): It works." in page
+    command.reproduce("smoke", draw_only=True, **places)
+    assert (tmp_path / "docs" / PAGE).read_text() == page
+
+
+def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
+    experiment = replace(SMOKE, panels=(Panel("2 joints", (DPN, DQN), seeds=4),))
+    returns = {DPN: [-2.0, -1.0, -3.0], DQN: [-4.0, -5.0, -6.0]}
+    made = [
+        run_of(condition, seed, [value, value])
+        for condition, values in returns.items()
+        for seed, value in enumerate(values)
+    ]
+    draw(experiment, made, tmp_path, "the command")
+    page = (tmp_path / PAGE).read_text()
+    assert "DPN's area under the curve is above DQN's: the mean paired difference is +3.00" in page
+    assert "| DPN - DQN | +2.00, +4.00, +3.00 | +3.00 | +2.00 to +4.00 | +0.52 to +5.48 |" in page
+    assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
