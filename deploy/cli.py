@@ -116,13 +116,17 @@ def run(
 
 
 def _refuse_unsupported(preset: Preset) -> None:
-    from actors.envs import ENV_IDS
-
     if preset.imitation is not None:
         raise PresetError(
             f"{preset.name}: expected a preset without [imitation]; got one; rewards from "
             "discriminators are not part of this version, choose a preset of chapter 3"
         )
+    _refuse_unknown_task(preset)
+
+
+def _refuse_unknown_task(preset: Preset) -> None:
+    from actors.envs import ENV_IDS
+
     if preset.task.environment not in ENV_IDS:
         raise PresetError(
             f"{preset.name}: expected a task of {', '.join(ENV_IDS)}; got "
@@ -394,6 +398,9 @@ def collect(
     episodes: int = 10,
     demonstrator: Literal["scripted", "random"] = "scripted",
     random_rate: float = 0.0,
+    quality: float | None = None,
+    quality_episodes: int = 20,
+    jobs: int = 1,
     settings: Settings = (),
 ) -> None:
     """Record demonstrations of a preset's task, without a learner.
@@ -404,15 +411,28 @@ def collect(
         episodes: How many there shall be.
         demonstrator: Who acts.
         random_rate: Share of the script's actions that are replaced by random ones.
+        quality: In place of a rate: 0 is as good as chance, 1 as the script. The rate is found.
+        quality_episodes: By which the quality of each rate is measured.
+        jobs: Processes that measure it.
         settings: Settings that replace the preset's.
     """
     from deploy.collect import collect_demonstrations
     from deploy.presets import load_preset
+    from deploy.quality import kept_quality
 
     _require_positive("episodes", episodes)
     console = Console()
     chosen = load_preset(preset, settings)
-    _refuse_unsupported(chosen)
+    _refuse_unknown_task(chosen)
+    if quality is not None:
+        if random_rate or demonstrator != "scripted":
+            raise PresetError(
+                "collect: expected --quality with the scripted demonstrator and without "
+                "--random-rate; got both; give one of them"
+            )
+        found = kept_quality(output, chosen.task, quality, quality_episodes, jobs)
+        console.print(f"{found}", highlight=False, soft_wrap=True)
+        random_rate = found.mistake_rate
     for trajectory in collect_demonstrations(chosen, output, episodes, demonstrator, random_rate):
         console.print(
             f"episode {trajectory.ticket.index + 1} of {episodes}: {trajectory.steps} steps, "

@@ -23,7 +23,7 @@ from actors.cloth.rasteriser import draw_cloth
 from actors.cloth.spreading import Side, SpreadAim, SpreadEnd
 from actors.envs import ClothTaskEnv, make_env
 from actors.envs.initial_states import check_initial_state
-from deploy.task_check import mapped
+from deploy.played_episodes import mapped
 
 SPREAD_COVERAGE: Final = 0.9
 """True normalised coverage above which a handkerchief is back."""

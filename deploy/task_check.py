@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal
 
 import numpy as np
 from rich.table import Table
@@ -17,7 +14,7 @@ from actors.acting import UniformlyRandom
 from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import ClothbusEnv, make_env
 from actors.rollout import ActingPolicy
-from deploy.process import end_with_parent
+from deploy.played_episodes import PlayedEpisode, mapped, play_episode
 
 LEAST_EXPERT: Final = 0.95
 """Portion of the expert's episodes that must end in success."""
@@ -28,26 +25,9 @@ MOST_CHANCE: Final = 0.10
 Among two or three actions of a few, chance may well name the right ones.
 """
 
-T = TypeVar("T")
-R = TypeVar("R")
-
 Player = Literal["expert", "chance"]
 PLAYERS: Final[tuple[Player, ...]] = ("expert", "chance")
 QUANTILES: Final = (0.02, 0.5, 0.98)
-
-
-@dataclass(frozen=True)
-class PlayedEpisode:
-    """How an episode went."""
-
-    success_at_end: bool
-    success_at_best: bool
-    guard: str | None
-    steps: int
-    steps_to_success: int | None
-    return_: float
-    measures: Mapping[str, float]
-    """The task's own, at the end."""
 
 
 @dataclass(frozen=True)
@@ -117,22 +97,12 @@ Chunk = tuple[Player, list[int]]
 """Who plays episodes of which numbers, in one environment."""
 
 
-def mapped(play: Callable[[T], R], chunks: list[T], jobs: int) -> Iterator[R]:
-    """What `play` makes of each chunk, in order, with so many processes."""
-    if jobs == 1:
-        yield from map(play, chunks)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, context, end_with_parent, (os.getpid(),)) as pool:
-        yield from pool.map(play, chunks)
-
-
 def _play(env_id: str, options: dict[str, Any], chunk: Chunk) -> list[PlayedEpisode]:
     player, numbers = chunk
     env = make_env(env_id, **options)
     try:
         policy = _policy(player, env)
-        return [_played(env, policy, number) for number in numbers]
+        return [play_episode(env, policy, number) for number in numbers]
     finally:
         env.close()
 
@@ -142,31 +112,6 @@ def _policy(player: Player, env: ClothbusEnv) -> ActingPolicy:
     if player == "chance":
         return UniformlyRandom(n_actions)
     return scripted_demonstrator(env, n_actions, mistake_rate=0.0)
-
-
-def _played(env: ClothbusEnv, policy: ActingPolicy, number: int) -> PlayedEpisode:
-    random = np.random.default_rng([number, 1])
-    picture, info = env.reset(seed=number)
-    successes, rewards, is_over = [], [], False
-    while not is_over:
-        picture, reward, terminated, truncated, info = env.step(policy.act(picture, random, 0.0))
-        successes.append(bool(info["success"]))
-        rewards.append(float(reward))
-        is_over = terminated or truncated
-    numbers = {
-        name: float(value)
-        for name, value in info.items()
-        if isinstance(value, float | np.floating) and not isinstance(value, bool)
-    }
-    return PlayedEpisode(
-        successes[-1],
-        any(successes),
-        info["guard"],
-        len(successes),
-        successes.index(True) + 1 if any(successes) else None,
-        sum(rewards),
-        numbers,
-    )
 
 
 def _portion(them: Iterator[bool]) -> str:

@@ -19,6 +19,7 @@ CURVES, FIGURE, PAGE = "curves.jsonl", "curves.png", "README.md"
 def reproduce(
     name: Annotated[str, tyro.conf.Positional],
     /,
+    conditions: tuple[str, ...] = (),
     seeds: int | None = None,
     iterations: int | None = None,
     jobs: int = 1,
@@ -33,6 +34,7 @@ def reproduce(
 
     Args:
         name: An experiment; an unknown name lists them.
+        conditions: Names of those to run and draw; all if not given.
         seeds: Of each condition; the experiment's own number if not given.
         iterations: How far runs are followed; they go on when it is more next time.
         jobs: Runs at a time, each in a process of its own with one thread.
@@ -45,7 +47,7 @@ def reproduce(
     """
     from deploy.reproduce.catalogue import find_experiment
 
-    experiment = with_changes(find_experiment(name), seeds, settings)
+    experiment = with_changes(find_experiment(name), seeds, settings, conditions)
     folder = Path("docs") / name if output is None else output
     plans, curves = list(experiment.plans()), folder / CURVES
     if draw_only:

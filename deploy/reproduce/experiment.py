@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import load_preset
 from deploy.reproduce.runs import RunKey, RunPlan
@@ -93,12 +94,29 @@ class Experiment:
                         yield self.plan(panel, condition, seed)
 
 
-def with_changes(experiment: Experiment, seeds: int | None, overrides: Sequence[str]) -> Experiment:
-    """The experiment with fewer or more seeds, or with other settings."""
-    panels = [
-        dataclasses.replace(panel, seeds=panel.seeds if seeds is None else seeds)
-        for panel in experiment.panels
-    ]
+def with_changes(
+    experiment: Experiment,
+    seeds: int | None = None,
+    overrides: Sequence[str] = (),
+    conditions: Sequence[str] = (),
+) -> Experiment:
+    """The experiment with fewer or more seeds, other settings, or some of its conditions alone.
+
+    Raises:
+        PresetError: There is no condition of a name.
+    """
+    names = {condition.name for panel in experiment.panels for condition in panel.conditions}
+    if unknown := [name for name in conditions if name not in names]:
+        raise PresetError(
+            f"{experiment.name}: expected conditions of {', '.join(sorted(names))}; got "
+            f"{unknown[0]}; choose among them"
+        )
+    panels = []
+    for panel in experiment.panels:
+        chosen = [it for it in panel.conditions if not conditions or it.name in conditions]
+        if chosen:
+            n_seeds = panel.seeds if seeds is None else seeds
+            panels.append(dataclasses.replace(panel, seeds=n_seeds, conditions=tuple(chosen)))
     return dataclasses.replace(
         experiment, panels=tuple(panels), overrides=(*experiment.overrides, *overrides)
     )

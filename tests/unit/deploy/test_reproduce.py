@@ -172,6 +172,14 @@ def test_every_experiment_of_the_catalogue_can_be_planned() -> None:
             assert (plan.preset.initialisation is not None) == (plan.key.start != "untrained")
 
 
+def test_some_conditions_alone() -> None:
+    chosen = with_changes(SMOKE, conditions=["dqn"])
+    assert [plan.key.condition for plan in chosen.plans()] == ["dqn", "dqn"]
+    assert {it.key for it in chosen.plans()} < {it.key for it in SMOKE.plans()}
+    with pytest.raises(PresetError, match=r"expected conditions of dpn, dqn.*got sarsa"):
+        with_changes(SMOKE, conditions=["sarsa"])
+
+
 def test_there_must_be_such_an_experiment() -> None:
     with pytest.raises(PresetError, match=r"expected one of dpn-vs-dqn.*got nothing"):
         find_experiment("nothing")

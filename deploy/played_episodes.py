@@ -1,0 +1,69 @@
+"""Episodes of a task alone, without a bus or a learner, in several processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from actors.envs import ClothbusEnv
+from actors.rollout import ActingPolicy
+from deploy.process import end_with_parent
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class PlayedEpisode:
+    """How an episode went."""
+
+    success_at_end: bool
+    success_at_best: bool
+    guard: str | None
+    steps: int
+    steps_to_success: int | None
+    return_: float
+    measures: Mapping[str, float]
+    """The task's own, at the end."""
+
+
+def play_episode(env: ClothbusEnv, policy: ActingPolicy, number: int) -> PlayedEpisode:
+    """Plays the episode of a number, which seeds task and player alike."""
+    random = np.random.default_rng([number, 1])
+    picture, info = env.reset(seed=number)
+    successes, rewards, is_over = [], [], False
+    while not is_over:
+        picture, reward, terminated, truncated, info = env.step(policy.act(picture, random, 0.0))
+        successes.append(bool(info["success"]))
+        rewards.append(float(reward))
+        is_over = terminated or truncated
+    numbers = {
+        name: float(value)
+        for name, value in info.items()
+        if isinstance(value, float | np.floating) and not isinstance(value, bool)
+    }
+    return PlayedEpisode(
+        successes[-1],
+        any(successes),
+        info["guard"],
+        len(successes),
+        successes.index(True) + 1 if any(successes) else None,
+        sum(rewards),
+        numbers,
+    )
+
+
+def mapped(play: Callable[[T], R], chunks: list[T], jobs: int) -> Iterator[R]:
+    """What `play` makes of each chunk, in order, with so many processes."""
+    if jobs == 1:
+        yield from map(play, chunks)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, context, end_with_parent, (os.getpid(),)) as pool:
+        yield from pool.map(play, chunks)

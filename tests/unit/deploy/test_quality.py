@@ -1,0 +1,47 @@
+"""Demonstrators of a chosen quality."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from broker_config.errors import PresetError, StorageError
+from deploy.presets import load_preset
+from deploy.quality import QUALITY_FILE, TOLERANCE, find_quality, kept_quality
+
+TASK = load_preset("reaching-smoke").task
+
+
+def test_more_mistakes_are_made_where_less_is_wanted() -> None:
+    tried: dict[float, float] = {}
+    rates = []
+    for wanted in (1.0, 0.7, 0.3, 0.0):
+        found = find_quality(TASK, wanted, 20, on_measured=tried.__setitem__)
+        assert found.measured == pytest.approx(wanted, abs=TOLERANCE + 0.03)
+        rates.append(found.mistake_rate)
+    assert rates == sorted(rates)
+    assert (rates[0], rates[-1]) == (0.0, 1.0)
+    assert all(0.0 < rate < 1.0 for rate in tried)
+
+
+def test_processes_do_not_change_what_is_found() -> None:
+    assert find_quality(TASK, 0.5, 6, jobs=2) == find_quality(TASK, 0.5, 6)
+
+
+def test_a_quality_is_measured_once_and_kept(tmp_path: Path) -> None:
+    first = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
+    path = tmp_path / "demos" / QUALITY_FILE
+    path.write_text(path.read_text().replace('"episodes": 6', '"episodes": 7'))
+    again = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
+    assert (again.mistake_rate, again.episodes) == (first.mistake_rate, 7)
+    with pytest.raises(StorageError, match=r"expected quality 0\.6; got one of 0\.5"):
+        kept_quality(tmp_path / "demos", TASK, 0.6, 6)
+    path.write_text("{}")
+    with pytest.raises(StorageError, match="expected a quality; got"):
+        kept_quality(tmp_path / "demos", TASK, 0.5, 6)
+
+
+def test_what_is_no_quality_is_refused() -> None:
+    with pytest.raises(PresetError, match=r"expected 0 \(chance\) to 1 \(the script\); got 1\.5"):
+        find_quality(TASK, 1.5, 2)
