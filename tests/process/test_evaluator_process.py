@@ -1,4 +1,4 @@
-"""The live evaluator as a process of a run: killed, stopped and ended. 140 s on two busy cores."""
+"""The live evaluator as a process of a run: killed, stopped and ended. 30 s on two cores."""
 
 from __future__ import annotations
 

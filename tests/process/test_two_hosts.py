@@ -29,8 +29,8 @@ from tests.process.conftest import Command, undisturbed_weights, weights
 CUT_SECS = 20.0
 LOSS = 0.01
 HORIZON = 10
-SETTINGS = ("schedule.iterations=20", "task.options.n_joints=5", "task.n_actions=25")
-EPISODES = 40
+SETTINGS = ("schedule.iterations=12", "task.options.n_joints=5", "task.n_actions=25")
+EPISODES = 24
 
 LEARNER_HOST, ACTOR_HOST = "learner", "actor"
 ADDRESSES = {LEARNER_HOST: "10.77.0.1", ACTOR_HOST: "10.77.0.2"}
