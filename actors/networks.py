@@ -62,11 +62,19 @@ class PreferenceNetwork(nn.Module):
         Returns:
             f32[B, A].
         """
+        return self.from_feature_maps(self.feature_maps(observations))
+
+    def feature_maps(self, observations: Tensor) -> Tensor:
+        """What the last convolution makes of pictures, f32[B, 64, h, w], after its ReLU."""
         # A permuted [B, H, W, C] picture is torch's channels_last layout: no copy is made for it.
-        features = observations.permute(0, 3, 1, 2).to(torch.float32) * (1.0 / 255.0)
+        maps = observations.permute(0, 3, 1, 2).to(torch.float32) * (1.0 / 255.0)
         for convolution in self.convolutions:
-            features = torch.relu(convolution(features))
-        features = features.flatten(1)
+            maps = torch.relu(convolution(maps))
+        return maps
+
+    def from_feature_maps(self, maps: Tensor) -> Tensor:
+        """Preferences f32[B, A] from what `feature_maps` gives."""
+        features = maps.flatten(1)
         return self.head(*(torch.relu(layer(features)) for layer in self.hidden_layers))
 
     @property

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from actors.grad_cam import grad_cam
 from actors.networks import allocate_network, check_weights, weights_from_bytes
 from broker_config.errors import MessageError
 from broker_config.specs import NetworkSpec
@@ -80,6 +81,10 @@ class Policy:
         scaled = self.spec.beta * self.preferences(observation)
         unnormalised = np.exp(scaled - scaled.max())
         return np.asarray(unnormalised / unnormalised.sum())
+
+    def attention(self, observation: NDArray[np.uint8], action: int) -> NDArray[np.float32]:
+        """What of a picture speaks for an action, f32[H, W] in 0...1: see `grad_cam`."""
+        return grad_cam(self._network, observation, action)
 
     def sample(self, observation: NDArray[np.uint8], generator: np.random.Generator) -> int:
         """Draws from the softmax policy; takes one number from the generator."""

@@ -15,7 +15,7 @@ from broker_config.heart import HUNG_SECS
 from broker_config.messages import Command
 from broker_config.preset import Preset
 from broker_config.session import DEFAULT_ADDRESS
-from deploy import task_commands
+from deploy import policy_commands, task_commands
 from deploy.priority import Priority
 from deploy.process import (
     CONFIGURATION_EXIT,
@@ -447,6 +447,7 @@ app.command(name="watch")(task_commands.watch)
 app.command(name="spread")(task_commands.spread)
 app.command(name="states")(task_commands.states)
 app.command(name="reproduce")(reproduce)
+app.command(name="attention")(policy_commands.attention)
 
 
 def _require_evaluable(episodes: int, in_process: bool) -> None:

@@ -18,8 +18,8 @@ from actors.envs import ClothbusEnv, ClothTaskEnv, make_env
 from actors.policy import Policy
 from actors.rollout import ActingPolicy
 from broker_config.errors import PresetError, StorageError
+from deploy.policies import newest_policy
 from deploy.run_folder import RunFolder
-from learner.snapshots import SnapshotStore
 
 FRAME_SECS: Final = 0.6
 ROBOT_FRAME_SECS: Final = 0.2
@@ -96,12 +96,7 @@ def _learned(folder: RunFolder, env: ClothbusEnv, n_actions: int) -> Policy:
             f"{expected[1]} actions, as its policy has; got {list(got[0])} and {got[1]}; watch it "
             f"at {preset.task.environment}"
         )
-    store = SnapshotStore(folder.snapshots)
-    if not (versions := store.versions()):
-        raise StorageError(f"{folder.path}: expected a policy; got none; let the run begin first")
-    weights = store.get(versions[-1])
-    assert weights is not None
-    return Policy.from_bytes(preset.network, weights)
+    return newest_policy(folder, preset)
 
 
 def played(env: ClothbusEnv, policy: ActingPolicy, seed: int) -> WatchedEpisode:

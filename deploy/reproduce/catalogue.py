@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from broker_config.errors import PresetError
-from deploy.reproduce.experiment import Condition, Experiment, Panel
+from deploy.reproduce.experiment import AttentionFigure, Condition, Experiment, Panel
 
 _DPN = ("algorithm.method=dpn", "algorithm.head=plain")
 _DUELING_DPN = ("algorithm.method=dpn", "algorithm.head=dueling-penalty")
@@ -166,17 +166,30 @@ _EXPERIMENTS = (
     ),
 )
 
+_ATTENTION_FIGURES = (
+    AttentionFigure(
+        name="figure-3.12",
+        title="Figure 3.12: what the t-shirt's policies look at",
+        source="figure 3.12",
+        published="The sleeves draw the agent's attention in the first two steps, the hem's corner "
+        "afterwards.",
+        experiment="figure-3.11",
+        conditions=("dueling-dpn-init", "dueling-dqn-init", "supervised"),
+    ),
+)
+
 EXPERIMENTS: Final = {experiment.name: experiment for experiment in _EXPERIMENTS}
+ATTENTION_FIGURES: Final = {figure.name: figure for figure in _ATTENTION_FIGURES}
 
 
-def find_experiment(name: str) -> Experiment:
-    """An experiment by its name.
+def find(name: str) -> Experiment | AttentionFigure:
+    """An experiment, or a figure of one's policies, by its name.
 
     Raises:
         PresetError: There is none of that name.
     """
-    if name not in EXPERIMENTS:
-        raise PresetError(
-            f"reproduce: expected one of {', '.join(EXPERIMENTS)}; got {name}; choose one"
-        )
-    return EXPERIMENTS[name]
+    found = EXPERIMENTS.get(name) or ATTENTION_FIGURES.get(name)
+    if found is None:
+        names = ", ".join(sorted([*EXPERIMENTS, *ATTENTION_FIGURES]))
+        raise PresetError(f"reproduce: expected one of {names}; got {name}; choose one")
+    return found

@@ -9,11 +9,11 @@ from typing import Annotated
 
 import tyro
 
-from deploy.reproduce.experiment import Experiment, with_changes
+from deploy.reproduce.experiment import AttentionFigure, Experiment, with_changes
 from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs
 from learner.compute import Compute, TrainingPath
 
-CURVES, FIGURE, PAGE = "curves.jsonl", "curves.png", "README.md"
+CURVES, FIGURE, ATTENTION, PAGE = "curves.jsonl", "curves.png", "attention.png", "README.md"
 
 
 def reproduce(
@@ -45,10 +45,16 @@ def reproduce(
         work: Folder of checkpoints, demonstrations and last policies.
         draw_only: Draw what is finished, and run nothing.
     """
-    from deploy.reproduce.catalogue import find_experiment
+    from deploy.reproduce.catalogue import find
 
-    experiment = with_changes(find_experiment(name), seeds, settings, conditions)
     folder = Path("docs") / name if output is None else output
+    told = [argument for argument in sys.argv[2:] if argument != "--draw-only"]
+    command = shlex.join(["clothbus", "reproduce", *told])
+    found = find(name)
+    if isinstance(found, AttentionFigure):
+        draw_attention_figure(found, work, folder, command)
+        return
+    experiment = with_changes(found, seeds, settings, conditions)
     plans, curves = list(experiment.plans()), folder / CURVES
     if draw_only:
         runs = finished_runs(plans, curves)
@@ -56,8 +62,6 @@ def reproduce(
         compute = Compute(device, training_path)
         sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
         runs = finish_runs(plans, curves, work / name, compute, jobs, iterations)
-    told = [argument for argument in sys.argv[2:] if argument != "--draw-only"]
-    command = shlex.join(["clothbus", "reproduce", *told])
     draw(experiment, runs, folder, command)
 
 
@@ -71,3 +75,19 @@ def draw(experiment: Experiment, runs: list[FinishedRun], folder: Path, command:
     draw_figure(folder / FIGURE, experiment, panels)
     write_page(folder / PAGE, experiment, panels, command, FIGURE)
     sys.stderr.write(f"{folder / PAGE}: {len(runs)} runs\n")
+
+
+def draw_attention_figure(figure: AttentionFigure, work: Path, folder: Path, command: str) -> None:
+    """Draws what the policies look at that an experiment has left.
+
+    Raises:
+        StorageError: It has left none.
+    """
+    from deploy.attention import draw_attention
+    from deploy.reproduce.attention_figure import attended_rows, write_attention_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = attended_rows(figure, work)
+    draw_attention(folder / ATTENTION, figure.title, rows)
+    write_attention_page(folder / PAGE, figure, command, ATTENTION)
+    sys.stderr.write(f"{folder / PAGE}: {len(rows)} policies\n")

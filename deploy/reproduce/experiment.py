@@ -94,6 +94,21 @@ class Experiment:
                         yield self.plan(panel, condition, seed)
 
 
+@dataclass(frozen=True)
+class AttentionFigure:
+    """What the last policies of an experiment look at, as Grad-CAM shows it."""
+
+    name: str
+    title: str
+    source: str
+    published: str
+    experiment: str
+    """Whose policies they are."""
+    conditions: tuple[str, ...]
+    seed: int = 0
+    steps: int = 4
+
+
 def with_changes(
     experiment: Experiment,
     seeds: int | None = None,

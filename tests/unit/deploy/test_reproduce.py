@@ -22,7 +22,7 @@ from deploy.reproduce.catalogue import (
     DUELING_DPN,
     EXPERIMENTS,
     SUPERVISED,
-    find_experiment,
+    find,
 )
 from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
 from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
@@ -182,7 +182,7 @@ def test_some_conditions_alone() -> None:
 
 def test_there_must_be_such_an_experiment() -> None:
     with pytest.raises(PresetError, match=r"expected one of dpn-vs-dqn.*got nothing"):
-        find_experiment("nothing")
+        find("nothing")
 
 
 def test_runs_survive_the_file(tmp_path: Path) -> None:
