@@ -63,4 +63,4 @@ class UniformlyRandom:
 
 def collecting_policy(algorithm: AlgorithmPreset, policy: Policy) -> ActingPolicy:
     """How an algorithm's actors collect: DQN epsilon-greedily, the DPN family by its softmax."""
-    return EpsilonGreedy(policy) if algorithm.method == "dqn" else Sampled(policy)
+    return EpsilonGreedy(policy) if algorithm.is_epsilon_greedy else Sampled(policy)

@@ -48,12 +48,12 @@ class TaskPreset:
 class AlgorithmPreset:
     """Which value-based update, and its temperatures."""
 
-    method: Literal["dpn", "edpn", "dqn"]
+    method: Literal["dpn", "edpn", "munchausen-dqn", "dqn", "double-dqn"]
     head: Head
     eta: float
     """Inverse temperature of the smooth policy update (eq. 2.5)."""
     sigma: float
-    """Weight of the causal entropy (eq. 4.4); 0 except for EDPN."""
+    """Weight of the causal entropy (eq. 4.4); 0 except for EDPN and Munchausen DQN."""
     gamma: float
     """Discount factor of one step, in [0, 1)."""
 
@@ -63,12 +63,22 @@ class AlgorithmPreset:
         finite_sigma = math.isfinite(self.sigma) and self.sigma >= 0
         _require(finite_sigma, "algorithm.sigma", "a finite number, 0 or more", self.sigma)
         _require(0 <= self.gamma < 1, "algorithm.gamma", "a number in [0, 1)", self.gamma)
-        if self.method != "edpn":
+        if self.method not in ("edpn", "munchausen-dqn"):
             _require(self.sigma == 0, "algorithm.sigma", f"0 for {self.method}", self.sigma)
-        is_dqn_head = self.head in ("plain", "dueling-mean")
+        is_q_head = self.head in ("plain", "dueling-mean")
         is_dpn_head = self.head != "dueling-mean"
-        fits = is_dqn_head if self.method == "dqn" else is_dpn_head
+        fits = is_q_head if self.is_epsilon_greedy else is_dpn_head
         _require(fits, "algorithm.head", f"a head that {self.method} has a meaning for", self.head)
+
+    @property
+    def is_epsilon_greedy(self) -> bool:
+        """Whether it acts by its preferred action and chance, not by the softmax policy."""
+        return self.method not in ("dpn", "edpn")
+
+    @property
+    def has_soft_value(self) -> bool:
+        """Whether V is eq. 2.9, not the largest Q."""
+        return self.method not in ("dqn", "double-dqn")
 
     @property
     def beta(self) -> float:
@@ -247,8 +257,9 @@ class Preset:
 
     def __post_init__(self) -> None:
         _require(0 <= self.seed < 2**32, "seed", "a number in [0, 2**32)", self.seed)
-        if self.algorithm.method == "dqn":
-            _require(self.exploration is not None, "exploration", "a table for dqn", None)
+        if self.algorithm.is_epsilon_greedy:
+            rule = f"a table for {self.algorithm.method}"
+            _require(self.exploration is not None, "exploration", rule, None)
         _ = self.network  # refuses shapes and sizes that no network can have
 
     @property

@@ -349,7 +349,7 @@ def evaluate(
             f"{', '.join(initial_states)}; name a file of states"
         )
     run_folder = RunFolder(folder)
-    is_dqn = run_folder.read_preset().algorithm.method == "dqn"
+    is_dqn = run_folder.read_preset().algorithm.is_epsilon_greedy
     chosen = mode or ("greedy" if is_dqn else "sampled")
     if stored_states is None:
         table = score_table(evaluate_versions(run_folder, versions, episodes or 100, chosen, jobs))

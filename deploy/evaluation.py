@@ -81,7 +81,7 @@ class Score:
 
 def modes_of(algorithm: AlgorithmPreset) -> tuple[Mode, ...]:
     """The ways in which a method's policy can act; Q has no softmax policy."""
-    return ("greedy",) if algorithm.method == "dqn" else ("sampled", "greedy")
+    return ("greedy",) if algorithm.is_epsilon_greedy else ("sampled", "greedy")
 
 
 # Keeping --------------------------------------------------------------------------------------

@@ -10,10 +10,13 @@ into the teaching signal. Only `terminated` cuts it off.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
+
+MUNCHAUSEN_BOUND: Final = -1.0
+"""l0: below it log pi / beta is not followed."""
 
 
 def soft_value(preferences: Tensor, beta: float) -> Tensor:
@@ -89,6 +92,51 @@ def dpn_teaching_signal(
         f32[B].
     """
     return alpha * (chosen - values) + bellman_target(rewards, next_values, terminated, gamma)
+
+
+def munchausen_teaching_signal(
+    chosen: Tensor,
+    values: Tensor,
+    rewards: Tensor,
+    next_values: Tensor,
+    terminated: Tensor,
+    *,
+    alpha: float,
+    gamma: float,
+) -> Tensor:
+    """y = alpha * clip(log pi(a given s) / beta, -1, 0) + r + gamma * V(s'), Munchausen DQN's.
+
+    Since log pi(a given s) = beta * (P(s, a) - V(s)), it is EDPN's signal but for the bound.
+
+    Source: Vieillard, Pietquin and Geist, Munchausen Reinforcement Learning, 2020, with tau = 1 /
+    beta and l0 = -1.
+
+    Args:
+        chosen: P(s, a) of the taken actions under the target network, f32[B].
+        values: V(s) under the target network, f32[B].
+        rewards: f32[B].
+        next_values: V(s') under the target network, f32[B].
+        terminated: bool[B]; where True, there is no value after the transition.
+        alpha: Weight of the clipped log policy.
+        gamma: Discount factor.
+
+    Returns:
+        f32[B].
+    """
+    log_policy = (chosen - values).clamp(MUNCHAUSEN_BOUND, 0.0)
+    return alpha * log_policy + bellman_target(rewards, next_values, terminated, gamma)
+
+
+def double_q_value(preferences: Tensor, choosing: Tensor) -> Tensor:
+    """Q(s, a) under the target network of the action that the network itself prefers, f32[B].
+
+    Source: van Hasselt, Guez and Silver, Deep Reinforcement Learning with Double Q-learning, 2016.
+
+    Args:
+        preferences: Q under the target network, f32[B, A].
+        choosing: Q under the network, f32[B, A].
+    """
+    return preferences.gather(1, choosing.argmax(1, keepdim=True)).squeeze(1)
 
 
 def bellman_target(

@@ -67,7 +67,7 @@ def make_ticket(
         steps_before: Steps of these.
     """
     exploration = preset.exploration
-    explores = preset.algorithm.method == "dqn" and exploration is not None
+    explores = preset.algorithm.is_epsilon_greedy and exploration is not None
     return Ticket(
         index=index,
         attempt=attempt,

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from torch import Tensor
 from actors.networks import PreferenceNetwork, build_network, weights_to_bytes
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import Preset
+from learner.assessment import Assessment, assess, double_q_signals
 from learner.compute import ON_CPU, Compute, TrainingPath
 from learner.cuda_graph import GraphedSteps, exact_float32
 from learner.gradient_steps import EagerSteps, GradientSteps
@@ -30,15 +30,7 @@ from learner.memory import LocalMemory
 from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
 from learner.product_steps import ProductSteps
 from learner.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
-from learner.teaching_signal import (
-    bellman_error,
-    bellman_target,
-    dpn_teaching_signal,
-    entropy,
-    epsilon_greedy_entropy,
-    epsilon_greedy_value,
-    soft_value,
-)
+from learner.teaching_signal import bellman_error
 
 _EVALUATED_AT_ONCE = 128
 """Pictures for which preferences are computed at a time."""
@@ -85,19 +77,6 @@ class _Counters:
     gradient_steps: int = 0
 
 
-class _Assessment(NamedTuple):
-    """What the network says of every sample of the memory."""
-
-    teaching_signals: Tensor
-    """y with this network as the target network, f32[n]."""
-    values: Tensor
-    """V(s), f32[n]."""
-    bellman_targets: Tensor
-    """r + gamma * V(s'), f32[n]."""
-    mean_entropy: Tensor
-    """f32[]."""
-
-
 class Trainer:
     """Improves a network from trajectories.
 
@@ -124,7 +103,7 @@ class Trainer:
         self._network = build_network(
             preset.network,
             stream_seed(preset.seed, WEIGHTS_STREAM),
-            starts_at_zero_value=algorithm.method != "dqn",
+            starts_at_zero_value=not algorithm.is_epsilon_greedy,
         ).to(compute.device)
         self._optimiser = build_optimiser(preset.optimiser, self._network)
         self._memory = LocalMemory(
@@ -200,7 +179,7 @@ class Trainer:
         losses, errors = [], []
         assessment = self._assess()
         for _ in range(N):
-            losses.append(self._solve_subproblem(assessment.teaching_signals))
+            losses.append(self._solve_subproblem(assessment))
             targets = assessment.bellman_targets
             assessment = self._assess()
             errors.append(bellman_error(assessment.values, targets))
@@ -266,15 +245,19 @@ class Trainer:
         }
         return network | optimiser
 
-    def _solve_subproblem(self, teaching_signals: Tensor) -> Tensor:
-        """Makes U epochs against fixed teaching signals; returns the mean loss, f32[]."""
+    def _solve_subproblem(self, frozen: Assessment) -> Tensor:
+        """Makes U epochs against a frozen target network; returns the mean loss, f32[]."""
         schedule = self._preset.schedule
+        chooses_itself = self._preset.algorithm.method == "double-dqn"
         self._counters.target_switches += 1
-        if schedule.subproblem_loss_threshold == 0:
-            return self._run_epochs(schedule.epochs, teaching_signals).mean()
+        if schedule.subproblem_loss_threshold == 0 and not chooses_itself:
+            return self._run_epochs(schedule.epochs, frozen.teaching_signals).mean()
         losses = []
         for _ in range(schedule.epochs):
-            losses.append(self._run_epochs(1, teaching_signals))
+            signals = frozen.teaching_signals
+            if chooses_itself:
+                signals = self._double_q_signals(frozen.preferences)
+            losses.append(self._run_epochs(1, signals))
             if losses[-1].mean().item() < schedule.subproblem_loss_threshold:
                 break
         return torch.cat(losses).mean()
@@ -295,35 +278,19 @@ class Trainer:
         return torch.cat(losses)
 
     @torch.no_grad()
-    def _assess(self) -> _Assessment:
-        algorithm, samples = self._preset.algorithm, self._memory.samples
-        preferences = self._evaluate_frames()
-        here, after = samples.positions, samples.positions + 1
-        if algorithm.method == "dqn":
-            epsilon = self._epsilon()
-            values = epsilon_greedy_value(preferences, epsilon)
-            best = preferences.amax(1)
-            signals = bellman_target(
-                samples.rewards, best[after], samples.terminated, algorithm.gamma
-            )
-            mean_entropy = epsilon_greedy_entropy(epsilon, preferences.shape[1])
-        else:
-            values = soft_value(preferences, algorithm.beta)
-            signals = dpn_teaching_signal(
-                preferences[here, samples.actions],
-                values[here],
-                samples.rewards,
-                values[after],
-                samples.terminated,
-                alpha=algorithm.alpha,
-                gamma=algorithm.gamma,
-            )
-            mean_entropy = entropy(preferences[here], algorithm.beta).mean()
-        targets = bellman_target(
-            samples.rewards, values[after], samples.terminated, algorithm.gamma
+    def _double_q_signals(self, frozen: Tensor) -> Tensor:
+        """Teaching signals of double DQN: the network as it is now chooses, once in an epoch."""
+        return double_q_signals(
+            self._preset.algorithm, self._memory.samples, frozen, self._evaluate_frames()
         )
-        return _Assessment(signals, values[here], targets, mean_entropy)
 
+    @torch.no_grad()
+    def _assess(self) -> Assessment:
+        return assess(
+            self._preset.algorithm, self._memory.samples, self._evaluate_frames(), self._epsilon()
+        )
+
+    @torch.no_grad()
     def _evaluate_frames(self) -> Tensor:
         """P(s, a) of every picture in the memory, f32[F, A]: each is s of one, s' of another."""
         with self._numerics():
@@ -340,7 +307,8 @@ class Trainer:
     def _epsilon(self) -> float:
         """Probability of a random action in the episode that acts on the updated network."""
         exploration, schedule = self._preset.exploration, self._preset.schedule
-        assert exploration is not None  # the preset refuses DQN without it
+        if exploration is None or not self._preset.algorithm.is_epsilon_greedy:
+            return 0.0
         per_update = 1 if schedule.update_every == "episode" else schedule.episodes_per_iteration
         return exploration.epsilon((self._counters.updates + 1) * per_update)
 

@@ -73,6 +73,28 @@ def _eta_panel(method: Condition) -> Panel:
     return Panel(method.label, conditions, seeds=5)
 
 
+MUNCHAUSEN: Final = Condition(
+    "munchausen-dqn",
+    "Munchausen DQN",
+    "C4",
+    # alpha 0.9 and tau 0.03, as published, in the source's terms: eqs. 4.8 and 4.10.
+    (
+        "algorithm.method=munchausen-dqn",
+        "algorithm.head=plain",
+        "algorithm.eta=37.037037037037",
+        "algorithm.sigma=0.003",
+    ),
+)
+DOUBLE_DQN: Final = Condition(
+    "double-dqn", "double DQN", "C5", ("algorithm.method=double-dqn", "algorithm.head=plain")
+)
+FULL_REPLAY_DQN: Final = Condition(
+    "dqn-full-replay",
+    "DQN, full replay",
+    "C8",
+    (*_DQN, "schedule.memory_samples=2250", "schedule.epochs=1"),
+)
+
 _CLOTH_NOTES = (
     "The task at its frozen medium difficulty; greedy episodes are on seeds that no run learns "
     "from.",
@@ -129,6 +151,26 @@ _EXPERIMENTS = (
         overrides=("schedule.epochs=4", *_ADAM),
         panels=(_eta_panel(DPN), _eta_panel(DUELING_DPN)),
         notes=("4 epochs instead of the source's 80, and Adam instead of RMSProp.",),
+    ),
+    Experiment(
+        name="relatives",
+        title="Modern relatives on reaching: Munchausen DQN, double DQN, full replay",
+        source="beside figure 3.5, 5 joints",
+        published="nothing: the source compares with DQN and Dueling DQN alone.",
+        preset="reaching-ch3",
+        overrides=("schedule.epochs=4", *_ADAM),
+        panels=(
+            Panel(
+                "5 joints",
+                (DPN, DUELING_DPN, MUNCHAUSEN, DOUBLE_DQN, DQN, FULL_REPLAY_DQN),
+                seeds=5,
+            ),
+        ),
+        notes=(
+            "4 epochs instead of the source's 80, and Adam instead of RMSProp.",
+            "Full replay: one epoch over all samples so far, which is about as many gradient steps "
+            "in all as four over the newest 450.",
+        ),
     ),
     Experiment(
         name="figure-3.9",

@@ -65,6 +65,8 @@ class Experiment:
     """Share of the demonstrator's actions that are random."""
     notes: tuple[str, ...] = ()
     """What a reader must know of the settings."""
+    changes: tuple[str, ...] = ()
+    """Settings that somebody has replaced, whatever the experiment says."""
 
     def preset_of(self, panel: Panel, condition: Condition, seed: int) -> Preset:
         """The preset of one run.
@@ -72,7 +74,8 @@ class Experiment:
         Raises:
             PresetError: There is no such preset, or an override cannot be used.
         """
-        overrides = (*self.overrides, *panel.overrides, *condition.overrides, f"seed={seed}")
+        made = (*self.overrides, *panel.overrides, *condition.overrides)
+        overrides = (*made, *self.changes, f"seed={seed}")
         preset = load_preset(self.preset, overrides)
         if condition.start == "untrained":
             return dataclasses.replace(preset, initialisation=None)
@@ -133,5 +136,5 @@ def with_changes(
             n_seeds = panel.seeds if seeds is None else seeds
             panels.append(dataclasses.replace(panel, seeds=n_seeds, conditions=tuple(chosen)))
     return dataclasses.replace(
-        experiment, panels=tuple(panels), overrides=(*experiment.overrides, *overrides)
+        experiment, panels=tuple(panels), changes=(*experiment.changes, *overrides)
     )

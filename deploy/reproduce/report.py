@@ -260,7 +260,12 @@ def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
         *(f"* {note}" for note in experiment.notes),
     ]
     changes = [
-        f"`{override}`" for override in (*experiment.overrides, *experiment.panels[0].overrides)
+        f"`{override}`"
+        for override in (
+            *experiment.overrides,
+            *experiment.panels[0].overrides,
+            *experiment.changes,
+        )
     ]
     if changes:
         lines.append(f"* Changed from the preset: {', '.join(changes)}.")

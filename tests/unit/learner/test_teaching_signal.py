@@ -8,10 +8,12 @@ from torch import Tensor
 from learner.teaching_signal import (
     bellman_error,
     bellman_target,
+    double_q_value,
     dpn_teaching_signal,
     entropy,
     epsilon_greedy_entropy,
     epsilon_greedy_value,
+    munchausen_teaching_signal,
     soft_value,
     softmax_policy,
 )
@@ -62,6 +64,24 @@ def test_teaching_signals_by_hand() -> None:
     assert signal(alpha=0.8) == pytest.approx(0.8 * (2.0 - 3.0) - 0.5 + 0.9 * 4.0)  # EDPN, 4.10
     dqn = bellman_target(torch.tensor([-0.5]), torch.tensor([4.0]), NOT_ENDED, 0.9)
     assert dqn.item() == pytest.approx(-0.5 + 0.9 * 4.0)  # DQN, eq. 2.12
+
+
+def test_munchausen_is_edpn_but_for_the_bound() -> None:
+    values = torch.tensor([3.0, 3.0])
+    chosen = torch.tensor([2.7, -5.0])  # log pi / beta of -0.3 and of -8
+    rewards, after = torch.tensor([-0.5, -0.5]), torch.tensor([4.0, 4.0])
+    ended = torch.zeros(2, dtype=torch.bool)
+    numbers = {"alpha": 0.9, "gamma": 0.9}
+    munchausen = munchausen_teaching_signal(chosen, values, rewards, after, ended, **numbers)
+    edpn = dpn_teaching_signal(chosen, values, rewards, after, ended, **numbers)
+    assert munchausen[0] == edpn[0]
+    assert munchausen[1].item() == pytest.approx(0.9 * -1.0 - 0.5 + 0.9 * 4.0)
+
+
+def test_double_q_takes_the_targets_value_of_the_networks_choice() -> None:
+    target = torch.tensor([[1.0, 9.0, 2.0], [5.0, 4.0, 3.0]])
+    network = torch.tensor([[0.0, 1.0, 7.0], [2.0, 8.0, 1.0]])
+    assert double_q_value(target, network).tolist() == [2.0, 4.0]
 
 
 def test_a_termination_cuts_off_what_follows() -> None:

@@ -90,6 +90,33 @@ def test_causal_entropy_changes_the_result() -> None:
     assert not same_state(changed, trained(PRESET).get_state())
 
 
+def test_double_dqn_is_dqn_until_the_network_prefers_other_actions() -> None:
+    """With one epoch the network is still the target network when it chooses."""
+    dqn = preset_with(algorithm__method="dqn", schedule__epochs=1)
+    double = preset_with(algorithm__method="double-dqn", schedule__epochs=1)
+    assert same_state(trained(double).get_state(), trained(dqn).get_state())
+    longer = {"schedule__epochs": 30, "optimiser__learning_rate": 1e-2}
+    dqn = preset_with(algorithm__method="dqn", **longer)
+    double = preset_with(algorithm__method="double-dqn", **longer)
+    assert not same_state(trained(double).get_state(), trained(dqn).get_state())
+
+
+def test_munchausen_dqn_is_edpn_where_nothing_is_unlikely_enough_to_be_clipped() -> None:
+    """At a low temperature no log policy reaches the bound."""
+    temperatures = {"algorithm__eta": 40.0, "algorithm__sigma": 0.003}
+    munchausen = preset_with(algorithm__method="munchausen-dqn", **temperatures)
+    edpn = preset_with(algorithm__method="edpn", **temperatures)
+    signals = []
+    for preset in (munchausen, edpn):
+        trainer = Trainer(preset)
+        with torch.no_grad():  # the same network, whatever it starts from
+            for parameter in trainer._network.parameters():
+                parameter.copy_(torch.linspace(-0.01, 0.01, parameter.numel()).view_as(parameter))
+        add_trajectory(trainer, 0)
+        signals.append(trainer._assess().teaching_signals)
+    assert torch.equal(*signals)
+
+
 def test_the_same_calls_give_the_same_state() -> None:
     assert same_state(trained(PRESET).get_state(), trained(PRESET).get_state())
     other_seed = replace(PRESET, seed=4)
