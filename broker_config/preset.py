@@ -226,6 +226,52 @@ class InitialisationPreset:
 
 
 @dataclass(frozen=True)
+class DiscriminatorPreset:
+    """How discriminators are trained and their rewards formed; the source gives none of it."""
+
+    learning_rate: float
+    """Of Adam."""
+    adam_beta1: float
+    minibatch_size: int
+    """Real states of a minibatch, and as many generated ones."""
+    random_shift_px: int
+    """Pictures, real and generated alike, are shifted by up to so much; 0 for none."""
+    colour_jitter: float
+    """Colours are scaled by up to so much more or less; 0 for none."""
+    spectral_norm: bool
+    """Whether each layer's largest singular value is held at 1."""
+    most_accuracy: float
+    """An iteration's epochs end once the discriminator is right so often; 1 for never."""
+    gradient_penalty: float
+    """Weight of the squared gradient by real pictures; 0 for none."""
+    target_prior: float
+    """Portion of target states among the generated ones, for the non-negative loss of positive and
+    unlabelled data; 0 for the loss of eq. 4.13."""
+    reward_bound: float
+    """A discriminator's reward is at most this."""
+    normalise_each: bool
+    """Whether each discriminator's rewards are brought to the same spread before they are added."""
+    centre_rewards: bool
+    """Whether their mean over D_G is subtracted."""
+
+    def __post_init__(self) -> None:
+        for name in ("learning_rate", "reward_bound"):
+            value = getattr(self, name)
+            ok = math.isfinite(value) and value > 0
+            _require(ok, f"imitation.discriminator.{name}", "a finite positive number", value)
+        for name in ("adam_beta1", "colour_jitter", "target_prior"):
+            value = getattr(self, name)
+            _require(0 <= value < 1, f"imitation.discriminator.{name}", "in [0, 1)", value)
+        for name, least in (("minibatch_size", 1), ("random_shift_px", 0), ("gradient_penalty", 0)):
+            value = getattr(self, name)
+            ok = math.isfinite(value) and value >= least
+            _require(ok, f"imitation.discriminator.{name}", f"at least {least}", value)
+        accuracy = self.most_accuracy
+        rule = "a portion above 0.5, at most 1"
+        _require(0.5 < accuracy <= 1, "imitation.discriminator.most_accuracy", rule, accuracy)
+
+
+@dataclass(frozen=True)
 class ImitationPreset:
     """Algorithm 4: rewards come from discriminators."""
 
@@ -237,6 +283,7 @@ class ImitationPreset:
     generator_epochs: int
     """K."""
     target_switch: Literal["epoch", "iteration"]
+    discriminator: DiscriminatorPreset
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,5 @@
-"""Rewards from demonstrations and target states (PGAIL-BiD, chapter 4): reserved for that service.
+"""Rewards from demonstrations and target states (PGAIL-BiD, chapter 4).
 
-Nothing of it is in this version; presets with an `[imitation]` table are refused by `clothbus run`.
+The cores are here: networks, losses, rewards and their trainer. The service that follows a run over
+the bus is not in this version, and `clothbus run` refuses presets with an `[imitation]` table.
 """

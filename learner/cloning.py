@@ -14,9 +14,9 @@ from actors.networks import PreferenceNetwork, build_network
 from broker_config.errors import MessageError
 from broker_config.messages import Trajectory
 from broker_config.preset import Preset
+from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.memory import LocalMemory
 from learner.optimiser import build_optimiser
-from learner.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 
 
 @dataclass(frozen=True)

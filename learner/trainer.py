@@ -22,6 +22,7 @@ from torch import Tensor
 from actors.networks import PreferenceNetwork, build_network, weights_to_bytes
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import Preset
+from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.assessment import Assessment, assess, double_q_signals
 from learner.compute import ON_CPU, Compute, TrainingPath
 from learner.cuda_graph import GraphedSteps, exact_float32
@@ -29,7 +30,6 @@ from learner.gradient_steps import EagerSteps, GradientSteps
 from learner.memory import LocalMemory
 from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
 from learner.product_steps import ProductSteps
-from learner.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.teaching_signal import bellman_error
 
 _EVALUATED_AT_ONCE = 128

@@ -8,6 +8,7 @@ import numpy as np
 
 WEIGHTS_STREAM: Final = 0
 SHUFFLING_STREAM: Final = 1
+DISCRIMINATORS_STREAM: Final = 2
 
 
 def stream_seed(seed: int, stream: int) -> int:
