@@ -284,6 +284,9 @@ class ImitationPreset:
     """K."""
     target_switch: Literal["epoch", "iteration"]
     discriminator: DiscriminatorPreset
+    target_reward: float | None = None
+    """A demonstrated state is a target where its task reward is at least this; without it the last
+    state of each demonstration that succeeded at its end is one."""
 
 
 @dataclass(frozen=True)

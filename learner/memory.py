@@ -146,6 +146,10 @@ class LocalMemory:
             samples.terminated[indices],
         )
 
+    def states_after(self) -> Tensor:
+        """The picture after each sample, u8[n, H, W, C], oldest first."""
+        return self.ring[(self.ring_positions + 1) % len(self.ring)]
+
     def replace_rewards(self, rewards: Tensor) -> None:
         """Gives every sample a new reward, oldest first: Algorithm 4 labels anew.
 

@@ -42,6 +42,8 @@ class Panel:
     seeds: int
     """Seeds 0, 1, ... are given to every condition."""
     overrides: tuple[str, ...] = ()
+    mistake_rate: float | None = None
+    """Of its demonstrations; the experiment's if None."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,13 @@ class Experiment:
     def plan(self, panel: Panel, condition: Condition, seed: int) -> RunPlan:
         """All that determines one run."""
         preset = self.preset_of(panel, condition, seed)
-        rate = None if condition.start == "untrained" else self.mistake_rate
+        needs_none = condition.start == "untrained" and preset.imitation is None
+        rate = None if needs_none else self._mistake_rate_of(panel)
         key = RunKey(condition.name, seed, preset.digest, condition.start, rate, self.episodes)
         return RunPlan(key, preset)
+
+    def _mistake_rate_of(self, panel: Panel) -> float:
+        return self.mistake_rate if panel.mistake_rate is None else panel.mistake_rate
 
     def plans(self) -> Iterator[RunPlan]:
         """All runs, seed by seed: what is finished first can be compared first."""

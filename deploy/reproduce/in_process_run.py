@@ -23,13 +23,19 @@ from broker_config.messages import Trajectory, TrajectoryId
 from broker_config.structure import from_plain, to_plain
 from deploy.collect import collect_demonstrations
 from deploy.player import GUARDED_ATTEMPTS, Player
+from deploy.relabelling import relabel
 from deploy.reproduce.runs import CurvePoint, RunPlan
+from discriminator.real_states import real_states
+from discriminator.trainer import Discriminators
 from learner.checkpoint import CheckpointStore
 from learner.cloning import Cloned, clone, cloning_preset
 from learner.compute import ON_CPU, Compute
 from learner.recorded import first_samples
 from learner.tickets import make_ticket
-from learner.trainer import Trainer, UpdateReport
+from learner.trainer import Trainer, TrainerState, UpdateReport
+
+_DISCRIMINATORS = "discriminators."
+"""Before the names of their tensors in a checkpoint."""
 
 
 class InProcessRun(Closing):
@@ -68,9 +74,10 @@ class InProcessRun(Closing):
         self._policy: Policy | None = None
         """The current one, once somebody has asked for it."""
         self._cloned: Cloned | None = None
+        self._discriminators = self._new_discriminators()
         self.points: list[CurvePoint] = []
         if (checkpoint := self._checkpoints.latest()) is not None:
-            self._trainer.set_state(checkpoint.state)
+            self._restore(checkpoint.state)
             self.points = [
                 from_plain(point, CurvePoint, "checkpoint.points")
                 for point in checkpoint.extra["points"]
@@ -107,7 +114,7 @@ class InProcessRun(Closing):
             self.points.append(self._iterate() if self.points else self._begin())
             if self._cloned is None:  # cloning is short, and no trainer's state
                 extra = {"points": [to_plain(point) for point in self.points]}
-                self._checkpoints.save(self._trainer.get_state(), extra)
+                self._checkpoints.save(self._state(), extra)
             yield self.points[-1]
 
     def _begin(self) -> CurvePoint:
@@ -122,10 +129,7 @@ class InProcessRun(Closing):
             report = self._trainer.initialise()
             loss, gradient_steps = report.loss, report.gradient_steps
         if self._plan.key.start == "cloned":
-            wanted = self._preset.initialisation
-            assert wanted is not None  # or there were no demonstrations
-            epochs = wanted.target_switches * self._preset.schedule.epochs
-            self._cloned = clone(self._preset, demonstrations, epochs)
+            self._cloned = clone(self._preset, demonstrations, self._cloning_epochs())
             loss, gradient_steps = self._cloned.loss, self._cloned.gradient_steps
         greedy_return, success = self._score()
         returns = [each.return_ for each in demonstrations]
@@ -158,6 +162,8 @@ class InProcessRun(Closing):
             self._add(played)
             returns.append(played.return_)
             if schedule.updates_after(index):
+                if self._discriminators is not None:
+                    relabel(self._trainer, self._discriminators)
                 report = self._trainer.update()
                 self._policy = None
                 updated_at.append((index + 1) * self._preset.task.horizon)
@@ -177,6 +183,40 @@ class InProcessRun(Closing):
             relative_bellman_error=report.relative_bellman_error,
             secs=time.perf_counter() - began_secs,
         )
+
+    def _new_discriminators(self) -> Discriminators | None:
+        imitation = self._preset.imitation
+        if imitation is None or self._plan.key.start == "cloned":
+            return None
+        real = real_states(self._demonstrations(), imitation.target_reward)
+        return Discriminators(self._preset, real)
+
+    def _cloning_epochs(self) -> int:
+        """As many as the learner's beside it: of its initialisation, or of all that it imitates."""
+        initialisation, imitation = self._preset.initialisation, self._preset.imitation
+        if initialisation is not None:
+            return initialisation.target_switches * self._preset.schedule.epochs
+        assert imitation is not None  # or there were no demonstrations
+        return imitation.generator_epochs * self._preset.schedule.iterations
+
+    def _state(self) -> TrainerState:
+        state = self._trainer.get_state()
+        if self._discriminators is None:
+            return state
+        theirs = self._discriminators.get_state()
+        tensors = {f"{_DISCRIMINATORS}{name}": part for name, part in theirs.items()}
+        return TrainerState({**state.tensors, **tensors}, state.counters)
+
+    def _restore(self, state: TrainerState) -> None:
+        of_trainer, of_discriminators = {}, {}
+        for name, part in state.tensors.items():
+            if name.startswith(_DISCRIMINATORS):
+                of_discriminators[name.removeprefix(_DISCRIMINATORS)] = part
+            else:
+                of_trainer[name] = part
+        self._trainer.set_state(TrainerState(of_trainer, state.counters))
+        if self._discriminators is not None:
+            self._discriminators.set_state(of_discriminators)
 
     def _current_policy(self) -> Policy:
         if self._policy is None:
@@ -222,11 +262,14 @@ class InProcessRun(Closing):
 
     def _demonstrations(self) -> list[Trajectory]:
         """Made by whoever needs them first; the same for all conditions of a seed."""
-        rate, wanted = self._plan.key.mistake_rate, self._preset.initialisation
+        rate = self._plan.key.mistake_rate
+        wanted = self._preset.initialisation or self._preset.imitation
         if rate is None or wanted is None:
             return []
         # Whatever learns from them has nothing to do with how they are made.
-        neutral = replace(cloning_preset(self._preset), exploration=None, initialisation=None)
+        neutral = replace(
+            cloning_preset(self._preset), exploration=None, initialisation=None, imitation=None
+        )
         folder = self._work / "demonstrations" / f"{neutral.digest[:12]}-{rate:g}"
         folder.parent.mkdir(parents=True, exist_ok=True)
         episodes = -(-wanted.demonstration_samples // self._preset.task.horizon)

@@ -16,14 +16,9 @@ from broker_config.messages import Trajectory
 from broker_config.preset import Preset
 from deploy.presets import preset_names
 from deploy.reproduce import command
-from deploy.reproduce.catalogue import (
-    DPN,
-    DQN,
-    DUELING_DPN,
-    EXPERIMENTS,
-    SUPERVISED,
-    find,
-)
+from deploy.reproduce.catalogue import EXPERIMENTS, find
+from deploy.reproduce.chapter3 import DPN, DQN, DUELING_DPN, SUPERVISED
+from deploy.reproduce.chapter4 import BID, CLONING, QGAIL
 from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
 from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
 from deploy.reproduce.in_process_run import InProcessRun, policy_file
@@ -51,6 +46,27 @@ SMOKE = Experiment(
     overrides=("initialisation.demonstration_samples=15", "initialisation.target_switches=2"),
     measures=("greedy_returns", "greedy_successes", "relative_bellman_errors"),
     mistake_rate=0.25,
+)
+
+
+IMITATION = Experiment(
+    name="imitation",
+    title="A short imitation",
+    source="figure 0",
+    published="It imitates.",
+    preset="reaching-ch4-horizon30",
+    panels=(Panel("2 joints", (BID, QGAIL, CLONING), seeds=1, mistake_rate=0.1),),
+    overrides=(
+        "task.options.n_joints=2",
+        "task.n_actions=10",
+        "schedule.iterations=2",
+        "schedule.episodes_per_iteration=2",
+        "schedule.target_switches=2",
+        "imitation.demonstration_samples=40",
+        "imitation.discriminator.minibatch_size=16",
+        "imitation.generator_epochs=2",
+        "imitation.target_reward=-0.5",
+    ),
 )
 
 
@@ -155,6 +171,36 @@ def test_a_cloned_policy_does_what_was_demonstrated(tmp_path: Path) -> None:
     assert np.mean(agrees) > 0.8
 
 
+@pytest.mark.parametrize("condition", [BID, QGAIL, CLONING], ids=lambda it: it.name)
+def test_an_interrupted_imitation_goes_on_as_if_it_had_not_been(
+    tmp_path: Path, condition: Condition
+) -> None:
+    plan = IMITATION.plan(IMITATION.panels[0], condition, 0)
+    assert plan.key.mistake_rate == 0.1
+    last = 0 if condition is CLONING else 2
+    with InProcessRun(plan, tmp_path / "whole") as whole:
+        list(whole.finish(last))
+        expected = whole.keep_policy().read_bytes()
+    with InProcessRun(plan, tmp_path / "parts") as interrupted:
+        next(interrupted.finish(last))
+        next(interrupted.finish(last), None)
+    with InProcessRun(plan, tmp_path / "parts") as resumed:
+        list(resumed.finish(last))
+        assert resumed.keep_policy().read_bytes() == expected
+    assert without_time(resumed.points) == without_time(whole.points)
+
+
+def test_imitation_learns_from_the_discriminators_rewards_alone(tmp_path: Path) -> None:
+    plan = IMITATION.plan(IMITATION.panels[0], BID, 0)
+    with InProcessRun(plan, tmp_path) as run:
+        list(run.finish(1))
+        memory, discriminators = run._trainer.memory, run._discriminators
+        assert discriminators is not None
+        rewards = discriminators.rewards(memory.states_after())
+    assert torch.equal(memory.samples.rewards, rewards)
+    assert len(rewards) == 60
+
+
 def test_a_policy_lag_is_refused(tmp_path: Path) -> None:
     experiment = with_changes(SMOKE, None, ["schedule.policy_lag=1"])
     with pytest.raises(ValueError, match=r"expected schedule\.policy_lag 0; got 1"):
@@ -169,7 +215,8 @@ def test_every_experiment_of_the_catalogue_can_be_planned() -> None:
         assert len(names) == len(plans), experiment.name
         for plan in plans:
             assert isinstance(plan.preset, Preset)
-            assert (plan.preset.initialisation is not None) == (plan.key.start != "untrained")
+            has_demonstrations = plan.preset.initialisation or plan.preset.imitation
+            assert (plan.key.mistake_rate is not None) == (has_demonstrations is not None)
 
 
 def test_some_conditions_alone() -> None:

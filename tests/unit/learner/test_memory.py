@@ -113,6 +113,12 @@ def test_live_frames_come_in_parts() -> None:
     assert len(whole) == n
 
 
+def test_the_state_after_each_sample_is_the_next_one_of_its_minibatch() -> None:
+    memory = filled(10, [7, 1, 2] * 3)
+    everything = memory.minibatch(torch.arange(len(memory)))
+    assert torch.equal(memory.states_after(), everything.next_observations)
+
+
 def test_rewards_can_be_replaced() -> None:
     memory = filled(10, [7, 7])
     before = contents(memory)
