@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from torch import Tensor
@@ -9,13 +10,13 @@ from torch import Tensor
 from broker_config.preset import AlgorithmPreset
 from learner.memory import Samples
 from learner.teaching_signal import (
+    MUNCHAUSEN_BOUND,
     bellman_target,
     double_q_value,
     dpn_teaching_signal,
     entropy,
     epsilon_greedy_entropy,
     epsilon_greedy_value,
-    munchausen_teaching_signal,
     soft_value,
 )
 
@@ -56,8 +57,7 @@ def assess(
     else:
         values = soft_value(preferences, algorithm.beta)
         is_munchausen = algorithm.method == "munchausen-dqn"
-        teach = munchausen_teaching_signal if is_munchausen else dpn_teaching_signal
-        signals = teach(
+        signals = dpn_teaching_signal(
             preferences[here, samples.actions],
             values[here],
             samples.rewards,
@@ -65,6 +65,7 @@ def assess(
             samples.terminated,
             alpha=algorithm.alpha,
             gamma=algorithm.gamma,
+            least_log_policy=MUNCHAUSEN_BOUND if is_munchausen else -math.inf,
         )
         mean_entropy = entropy(preferences[here], algorithm.beta).mean()
     targets = bellman_target(samples.rewards, values[after], samples.terminated, algorithm.gamma)

@@ -10,13 +10,14 @@ into the teaching signal. Only `terminated` cuts it off.
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
 
 MUNCHAUSEN_BOUND: Final = -1.0
-"""l0: below it log pi / beta is not followed."""
+"""l0, as published."""
 
 
 def soft_value(preferences: Tensor, beta: float) -> Tensor:
@@ -73,11 +74,13 @@ def dpn_teaching_signal(
     *,
     alpha: float,
     gamma: float,
+    least_log_policy: float = -math.inf,
 ) -> Tensor:
     """y = alpha * (P(s, a) - V(s)) + r + gamma * V(s'), of EDPN and of DPN.
 
     Source: eqs. 4.7 and 4.10; with alpha = 1 (sigma = 0) eqs. 2.11 and 3.1, bit for bit, since a
-    product with 1.0 is exact.
+    product with 1.0 is exact. P(s, a) - V(s) is log pi(a given s) / beta: with a bound below it the
+    signal is Munchausen DQN's (Vieillard, Pietquin and Geist, 2020: tau is 1 / beta, l0 the bound).
 
     Args:
         chosen: P(s, a) of the taken actions under the target network, f32[B].
@@ -87,43 +90,12 @@ def dpn_teaching_signal(
         terminated: bool[B]; where True, there is no value after the transition.
         alpha: 1 / (1 + sigma * eta).
         gamma: Discount factor.
+        least_log_policy: Below it log pi / beta is not followed.
 
     Returns:
         f32[B].
     """
-    return alpha * (chosen - values) + bellman_target(rewards, next_values, terminated, gamma)
-
-
-def munchausen_teaching_signal(
-    chosen: Tensor,
-    values: Tensor,
-    rewards: Tensor,
-    next_values: Tensor,
-    terminated: Tensor,
-    *,
-    alpha: float,
-    gamma: float,
-) -> Tensor:
-    """y = alpha * clip(log pi(a given s) / beta, -1, 0) + r + gamma * V(s'), Munchausen DQN's.
-
-    Since log pi(a given s) = beta * (P(s, a) - V(s)), it is EDPN's signal but for the bound.
-
-    Source: Vieillard, Pietquin and Geist, Munchausen Reinforcement Learning, 2020, with tau = 1 /
-    beta and l0 = -1.
-
-    Args:
-        chosen: P(s, a) of the taken actions under the target network, f32[B].
-        values: V(s) under the target network, f32[B].
-        rewards: f32[B].
-        next_values: V(s') under the target network, f32[B].
-        terminated: bool[B]; where True, there is no value after the transition.
-        alpha: Weight of the clipped log policy.
-        gamma: Discount factor.
-
-    Returns:
-        f32[B].
-    """
-    log_policy = (chosen - values).clamp(MUNCHAUSEN_BOUND, 0.0)
+    log_policy = (chosen - values).clamp_min(least_log_policy)
     return alpha * log_policy + bellman_target(rewards, next_values, terminated, gamma)
 
 

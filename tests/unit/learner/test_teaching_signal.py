@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from learner.teaching_signal import (
+    MUNCHAUSEN_BOUND,
     bellman_error,
     bellman_target,
     double_q_value,
@@ -13,7 +14,6 @@ from learner.teaching_signal import (
     entropy,
     epsilon_greedy_entropy,
     epsilon_greedy_value,
-    munchausen_teaching_signal,
     soft_value,
     softmax_policy,
 )
@@ -72,7 +72,9 @@ def test_munchausen_is_edpn_but_for_the_bound() -> None:
     rewards, after = torch.tensor([-0.5, -0.5]), torch.tensor([4.0, 4.0])
     ended = torch.zeros(2, dtype=torch.bool)
     numbers = {"alpha": 0.9, "gamma": 0.9}
-    munchausen = munchausen_teaching_signal(chosen, values, rewards, after, ended, **numbers)
+    munchausen = dpn_teaching_signal(
+        chosen, values, rewards, after, ended, **numbers, least_log_policy=MUNCHAUSEN_BOUND
+    )
     edpn = dpn_teaching_signal(chosen, values, rewards, after, ended, **numbers)
     assert munchausen[0] == edpn[0]
     assert munchausen[1].item() == pytest.approx(0.9 * -1.0 - 0.5 + 0.9 * 4.0)
