@@ -281,12 +281,17 @@ class ImitationPreset:
     discriminator_epochs: int
     """J."""
     generator_epochs: int
-    """K."""
-    target_switch: Literal["epoch", "iteration"]
+    """K: the schedule's target switches times its epochs. How often the target network is switched
+    in them is lost with Algorithm 4's indentation."""
     discriminator: DiscriminatorPreset
     target_reward: float | None = None
     """A demonstrated state is a target where its task reward is at least this; without it the last
     state of each demonstration that succeeded at its end is one."""
+
+    def __post_init__(self) -> None:
+        for name in ("demonstration_samples", "discriminator_epochs", "generator_epochs"):
+            value = getattr(self, name)
+            _require(value >= 1, f"imitation.{name}", "at least 1", value)
 
 
 @dataclass(frozen=True)
@@ -310,6 +315,11 @@ class Preset:
         if self.algorithm.is_epsilon_greedy:
             rule = f"a table for {self.algorithm.method}"
             _require(self.exploration is not None, "exploration", rule, None)
+        if self.imitation is not None:
+            made = self.schedule.target_switches * self.schedule.epochs
+            rule = f"schedule.target_switches * schedule.epochs, {made}"
+            epochs = self.imitation.generator_epochs
+            _require(epochs == made, "imitation.generator_epochs", rule, epochs)
         _ = self.network  # refuses shapes and sizes that no network can have
 
     @property

@@ -8,7 +8,8 @@ import numpy as np
 
 WEIGHTS_STREAM: Final = 0
 SHUFFLING_STREAM: Final = 1
-DISCRIMINATORS_STREAM: Final = 2
+EXPERT_DISCRIMINATOR_STREAM: Final = 2
+TARGET_DISCRIMINATOR_STREAM: Final = 3
 
 
 def stream_seed(seed: int, stream: int) -> int:

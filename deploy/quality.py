@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -44,6 +44,8 @@ class Quality:
     script_score: float
     episodes: int
     """By which each rate was measured."""
+    task: Mapping[str, str]
+    """The task's settings, as text."""
 
     def __str__(self) -> str:
         return (
@@ -75,6 +77,9 @@ def find_quality(
     """
     if not 0.0 <= wanted <= 1.0:
         raise PresetError(f"quality: expected 0 (chance) to 1 (the script); got {wanted:g}")
+    for name, value in (("quality_episodes", episodes), ("jobs", jobs)):
+        if value < 1:
+            raise PresetError(f"{name}: expected at least 1; got {value}")
     mean_score = partial(_mean_score, task, episodes, jobs)
     script, chance = mean_score(0.0), mean_score(1.0)
     if script <= chance:
@@ -94,7 +99,7 @@ def find_quality(
             on_measured(rate, found[rate])
         low, high = (rate, high) if found[rate] > wanted else (low, rate)
     best = min(found, key=lambda rate: abs(found[rate] - wanted))
-    return Quality(wanted, best, found[best], chance, script, episodes)
+    return Quality(wanted, best, found[best], chance, script, episodes, _as_text(task))
 
 
 def kept_quality(
@@ -104,7 +109,7 @@ def kept_quality(
 
     Raises:
         PresetError: See `find_quality`.
-        StorageError: The file is of another quality, or cannot be read or written.
+        StorageError: The file is of another quality or task, or cannot be read or written.
     """
     path = folder / QUALITY_FILE
     if path.exists():
@@ -112,9 +117,11 @@ def kept_quality(
             kept = from_plain(json.loads(path.read_text()), Quality, QUALITY_FILE)
         except (ValueError, MessageError) as error:
             raise StorageError(f"{path}: expected a quality; got {error}; move it away") from error
-        if kept.wanted != wanted:
+        asked, got = (wanted, episodes, _as_text(task)), (kept.wanted, kept.episodes, kept.task)
+        if asked != got:
             raise StorageError(
-                f"{path}: expected quality {wanted:g}; got one of {kept.wanted:g}; collect into "
+                f"{path}: expected quality {wanted:g} over {episodes} episodes of this task; got "
+                f"{kept.wanted:g} over {kept.episodes} of {kept.task['environment']}; collect into "
                 "another folder"
             )
         return kept
@@ -125,6 +132,16 @@ def kept_quality(
     except OSError as error:
         raise StorageError(f"{path}: expected to write it; got {error}") from error
     return found
+
+
+def _as_text(task: TaskPreset) -> dict[str, str]:
+    return {name: json.dumps(value) for name, value in _plain(task).items()}
+
+
+def _plain(task: TaskPreset) -> dict[str, object]:
+    plain = to_plain(task)
+    assert isinstance(plain, dict)  # as of every dataclass
+    return plain
 
 
 def _mean_score(task: TaskPreset, episodes: int, jobs: int, mistake_rate: float) -> float:

@@ -8,7 +8,7 @@ from learner.trainer import Trainer
 
 def relabel(trainer: Trainer, discriminators: Discriminators) -> dict[str, DiscriminatorReport]:
     """J epochs on what the memory holds, then a reward for every sample of it."""
-    states = trainer.memory.states_after()
+    states = trainer.memory.states_after().cpu()  # where discriminators are
     reports = discriminators.update(states)
     trainer.memory.replace_rewards(discriminators.rewards(states))
     return reports

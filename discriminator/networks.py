@@ -6,8 +6,6 @@ pictures apart rewards nothing that the generator can follow.
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
@@ -70,13 +68,8 @@ def build_discriminator(
         MessageError: The picture is too small for the convolutions.
     """
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)  # spectral norm begins from random vectors, too
-        network = DiscriminatorNetwork(observation_shape, spectral_norm)
-        with torch.no_grad():
-            for layer in (*network.convolutions, network.hidden, network.output):
-                bound = 1.0 / math.sqrt(layer.weight[0].numel())
-                torch.nn.init.uniform_(layer.bias, -bound, bound)
-    return network
+        torch.manual_seed(seed)  # for spectral norm's first vectors, too
+        return DiscriminatorNetwork(observation_shape, spectral_norm)
 
 
 def as_input(pictures: Tensor) -> Tensor:

@@ -15,7 +15,11 @@ from torch import Tensor
 
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import DiscriminatorPreset, ImitationPreset, Preset
-from broker_config.seeds import DISCRIMINATORS_STREAM, stream_seed
+from broker_config.seeds import (
+    EXPERT_DISCRIMINATOR_STREAM,
+    TARGET_DISCRIMINATOR_STREAM,
+    stream_seed,
+)
 from discriminator.augmentation import colour_jitter, random_shift
 from discriminator.losses import (
     accuracy,
@@ -29,6 +33,10 @@ from discriminator.rewards import join_rewards
 Positives = Literal["expert", "target"]
 
 _EVALUATED_AT_ONCE = 256
+_STREAMS: dict[Positives, int] = {
+    "expert": EXPERT_DISCRIMINATOR_STREAM,
+    "target": TARGET_DISCRIMINATOR_STREAM,
+}
 
 
 @dataclass(frozen=True)
@@ -66,10 +74,9 @@ class Discriminators:
             name: _Discriminator(
                 _checked(name, real.get(name), shape),
                 preset.imitation.discriminator,
-                stream_seed(preset.seed, DISCRIMINATORS_STREAM + number),
+                stream_seed(preset.seed, _STREAMS[name]),
             )
-            for number, name in enumerate(("expert", "target"))
-            if name in wanted
+            for name in wanted
         }
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +55,6 @@ def clone(
     preset: Preset,
     demonstrations: Iterable[Trajectory],
     epochs: int,
-    on_epoch: Callable[[], None] = lambda: None,
 ) -> Cloned:
     """Trains a policy to choose what the demonstrations chose.
 
@@ -65,7 +64,6 @@ def clone(
         preset: Gives network, optimiser, minibatch size and seed.
         demonstrations: At least one.
         epochs: How often each sample is learned from.
-        on_epoch: Called after each.
 
     Raises:
         MessageError: There are no demonstrations.
@@ -93,6 +91,5 @@ def clone(
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             losses.append(loss.item())
-        on_epoch()
     weights = {name: part.detach().clone() for name, part in network.state_dict().items()}
     return Cloned(weights, epochs * n_batches, float(np.mean(losses[-n_batches:])))

@@ -23,7 +23,8 @@ _PATHS: dict[str, tuple[TrainingPath, ...]] = {
 class Compute:
     """What a trainer computes on.
 
-    Results repeat bit for bit within a path, not from one path to another.
+    On a CPU results repeat bit for bit within a path, not from one path to another; on a GPU they
+    are equal up to rounding.
     """
 
     device: str = "cpu"

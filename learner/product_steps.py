@@ -30,7 +30,7 @@ class ProductSteps:
         memory: LocalMemory,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        """Prepares nothing yet: buffers are made when a minibatch size is first met.
+        """Prepares nothing yet: buffers are made when a minibatch size is met.
 
         Args:
             network: On the CPU, in the layout that `build_network` gives.
@@ -42,14 +42,15 @@ class ProductSteps:
         self._optimiser = optimiser
         self._memory = memory
         self._dtype = dtype
-        self._prepared: dict[int, _Trunk] = {}
+        self._trunk: _Trunk | None = None
 
     def run(self, batches: Tensor, targets: Tensor) -> Tensor:
         """See `GradientSteps.run`."""
         batch_size = batches.shape[1]
-        if batch_size not in self._prepared:
-            self._prepared[batch_size] = _Trunk(self._network, batch_size, self._dtype)
-        trunk = self._prepared[batch_size]
+        # One size at a time: a memory that is smaller than a minibatch has another at each update.
+        if self._trunk is None or self._trunk.batch_size != batch_size:
+            self._trunk = _Trunk(self._network, batch_size, self._dtype)
+        trunk = self._trunk
         positions, actions = self._memory.ring_positions, self._memory.samples.actions
         losses = torch.empty(len(batches))
         for step, batch in enumerate(batches):
@@ -74,7 +75,7 @@ class _Trunk:
 
     def __init__(self, network: PreferenceNetwork, batch_size: int, dtype: torch.dtype) -> None:
         height, width, channels = network.spec.observation_shape
-        self._dtype = dtype
+        self.batch_size = batch_size
         self._pixels = torch.empty((batch_size, height, width, channels), dtype=dtype)
         self._convolutions: list[_Convolution] = []
         inputs = self._pixels

@@ -52,7 +52,7 @@ def first_samples(trajectories: Iterable[Trajectory], samples: int) -> Iterator[
 
 
 def beginning(trajectory: Trajectory, steps: int) -> Trajectory:
-    """The first steps of a trajectory, which then ends without having terminated."""
+    """The first steps of a trajectory: it then ends without having terminated or succeeded."""
     return replace(
         trajectory,
         observations=trajectory.observations[: steps + 1],
@@ -60,4 +60,5 @@ def beginning(trajectory: Trajectory, steps: int) -> Trajectory:
         rewards=trajectory.rewards[:steps],
         terminated=False,
         truncated=True,
+        success=False,
     )

@@ -48,7 +48,7 @@ class UpdateReport:
     mean_value: float
     """Mean V(s): soft value, or E over the epsilon-greedy policy of Q for DQN."""
     mean_entropy: float
-    """Mean entropy of the acting policy, in nats."""
+    """Mean entropy in nats: of the epsilon-greedy policy for DQN, else of the softmax policy."""
     bellman_error: float
     """Eq. 3.6, mean over the sub-problems."""
     relative_bellman_error: float

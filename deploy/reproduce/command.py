@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from broker_config.errors import PresetError
 from deploy.reproduce.experiment import AttentionFigure, Experiment, with_changes
 from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs
 from learner.compute import Compute, TrainingPath
@@ -52,12 +53,18 @@ def reproduce(
     command = shlex.join(["clothbus", "reproduce", *told])
     found = find(name)
     if isinstance(found, AttentionFigure):
+        given = [seeds, iterations, training_path, *conditions, *settings]
+        if any(each is not None for each in given):
+            raise PresetError(
+                f"{name}: expected only --output and --work; it draws the policies that "
+                f"{found.experiment} has left, as it is in the catalogue; leave the others out"
+            )
         draw_attention_figure(found, work, folder, command)
         return
     experiment = with_changes(found, seeds, settings, conditions)
     plans, curves = list(experiment.plans()), folder / CURVES
     if draw_only:
-        runs = finished_runs(plans, curves)
+        runs = finished_runs(plans, curves, iterations)
     else:
         compute = Compute(device, training_path)
         sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
+import math
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,16 +20,15 @@ from broker_config.durable import write_durably
 from broker_config.errors import StorageError
 from broker_config.messages import Trajectory, TrajectoryId
 from broker_config.structure import from_plain, to_plain
-from deploy.collect import collect_demonstrations
 from deploy.player import GUARDED_ATTEMPTS, Player
 from deploy.relabelling import relabel
-from deploy.reproduce.runs import CurvePoint, RunPlan
+from deploy.reproduce.demonstrations import demonstrations_of
+from deploy.reproduce.runs import CurvePoint, RunPlan, checkpoints_folder
 from discriminator.real_states import real_states
 from discriminator.trainer import Discriminators
 from learner.checkpoint import CheckpointStore
 from learner.cloning import Cloned, clone, cloning_preset
 from learner.compute import ON_CPU, Compute
-from learner.recorded import first_samples
 from learner.tickets import make_ticket
 from learner.trainer import Trainer, TrainerState, UpdateReport
 
@@ -66,17 +64,18 @@ class InProcessRun(Closing):
                 f"{preset.name}: expected schedule.policy_lag 0; got {preset.schedule.policy_lag}; "
                 "one process collects and trains in turn"
             )
-        self._plan, self._preset, self._work = plan, preset, work
+        self._plan, self._preset, self._work, self._compute = plan, preset, work, compute
         self._env: ClothbusEnv | None = None
         self._player: Player | None = None
         self._trainer = Trainer(preset, compute)
-        self._checkpoints = CheckpointStore(self.checkpoints_folder)
+        self._checkpoints = CheckpointStore(checkpoints_folder(work, plan.key))
         self._policy: Policy | None = None
         """The current one, once somebody has asked for it."""
         self._cloned: Cloned | None = None
         self._discriminators = self._new_discriminators()
         self.points: list[CurvePoint] = []
         if (checkpoint := self._checkpoints.latest()) is not None:
+            self._require_same_compute(checkpoint.extra["compute"])
             self._restore(checkpoint.state)
             self.points = [
                 from_plain(point, CurvePoint, "checkpoint.points")
@@ -89,11 +88,6 @@ class InProcessRun(Closing):
             if each is not None:
                 each.close()
         self._env = self._player = None
-
-    @property
-    def checkpoints_folder(self) -> Path:
-        """May be removed once the run has been followed to its end."""
-        return self._work / "checkpoints" / self._plan.key.name
 
     def keep_policy(self) -> Path:
         """Stores the newest policy's weights beside the checkpoints; returns the file."""
@@ -113,14 +107,22 @@ class InProcessRun(Closing):
         while not self.points or self.points[-1].iteration < last:
             self.points.append(self._iterate() if self.points else self._begin())
             if self._cloned is None:  # cloning is short, and no trainer's state
-                extra = {"points": [to_plain(point) for point in self.points]}
+                points = [to_plain(point) for point in self.points]
+                extra = {"points": points, "compute": str(self._compute)}
                 self._checkpoints.save(self._state(), extra)
             yield self.points[-1]
+
+    def _require_same_compute(self, before: str) -> None:
+        if before != str(self._compute):
+            raise StorageError(
+                f"{self._plan.key.name}: expected to go on by {before}, as it was begun; got "
+                f"{self._compute}; choose that, or another --work"
+            )
 
     def _begin(self) -> CurvePoint:
         """Iteration 0: the untrained, the initialised or the cloned policy."""
         began_secs = time.perf_counter()
-        demonstrations = self._demonstrations()
+        demonstrations = demonstrations_of(self._plan, self._work)
         report: UpdateReport | None = None
         loss, gradient_steps = None, 0
         if self._plan.key.start == "initialised":
@@ -132,7 +134,8 @@ class InProcessRun(Closing):
             self._cloned = clone(self._preset, demonstrations, self._cloning_epochs())
             loss, gradient_steps = self._cloned.loss, self._cloned.gradient_steps
         greedy_return, success = self._score()
-        returns = [each.return_ for each in demonstrations]
+        horizon = self._preset.task.horizon
+        returns = [each.return_ for each in demonstrations if each.steps == horizon]
         return CurvePoint(
             iteration=0,
             samples=0,
@@ -141,10 +144,10 @@ class InProcessRun(Closing):
             greedy_returns=(greedy_return,),
             greedy_successes=(success,),
             training_return=float(np.mean(returns)) if returns else None,
-            loss=loss,
-            mean_value=report.mean_value if report else None,
-            bellman_error=report.bellman_error if report else None,
-            relative_bellman_error=report.relative_bellman_error if report else None,
+            loss=_finite(loss),
+            mean_value=_finite(report.mean_value if report else None),
+            bellman_error=_finite(report.bellman_error if report else None),
+            relative_bellman_error=_finite(report.relative_bellman_error if report else None),
             secs=time.perf_counter() - began_secs,
         )
 
@@ -177,10 +180,10 @@ class InProcessRun(Closing):
             greedy_returns=tuple(return_ for return_, _ in scores),
             greedy_successes=tuple(success for _, success in scores),
             training_return=float(np.mean(returns)),
-            loss=report.loss,
-            mean_value=report.mean_value,
-            bellman_error=report.bellman_error,
-            relative_bellman_error=report.relative_bellman_error,
+            loss=_finite(report.loss),
+            mean_value=_finite(report.mean_value),
+            bellman_error=_finite(report.bellman_error),
+            relative_bellman_error=_finite(report.relative_bellman_error),
             secs=time.perf_counter() - began_secs,
         )
 
@@ -188,7 +191,7 @@ class InProcessRun(Closing):
         imitation = self._preset.imitation
         if imitation is None or self._plan.key.start == "cloned":
             return None
-        real = real_states(self._demonstrations(), imitation.target_reward)
+        real = real_states(demonstrations_of(self._plan, self._work), imitation.target_reward)
         return Discriminators(self._preset, real)
 
     def _cloning_epochs(self) -> int:
@@ -260,23 +263,10 @@ class InProcessRun(Closing):
             float(np.mean([each.success for each in episodes])),
         )
 
-    def _demonstrations(self) -> list[Trajectory]:
-        """Made by whoever needs them first; the same for all conditions of a seed."""
-        rate = self._plan.key.mistake_rate
-        wanted = self._preset.initialisation or self._preset.imitation
-        if rate is None or wanted is None:
-            return []
-        # Whatever learns from them has nothing to do with how they are made.
-        neutral = replace(
-            cloning_preset(self._preset), exploration=None, initialisation=None, imitation=None
-        )
-        folder = self._work / "demonstrations" / f"{neutral.digest[:12]}-{rate:g}"
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        episodes = -(-wanted.demonstration_samples // self._preset.task.horizon)
-        with folder.with_name(f"{folder.name}.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            played = list(collect_demonstrations(neutral, folder, episodes, "scripted", rate))
-        return list(first_samples(played, wanted.demonstration_samples))
+
+def _finite(value: float | None) -> float | None:
+    """A number as files keep it: what has diverged is none."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def policy_file(work: Path, plan: RunPlan) -> Path:

@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
+from deploy.presets import load_preset
 from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
 from deploy.reproduce.runs import FinishedRun, RunKey
 from deploy.reproduce.statistics import (
@@ -161,6 +162,7 @@ def write_page(
     for panel_runs in panels:
         parts += [
             f"## {panel_runs.panel.title}",
+            _panel_settings(panel_runs.panel),
             _conclusion(panel_runs),
             _scores_table(experiment, panel_runs),
             _differences_table(panel_runs),
@@ -171,6 +173,11 @@ def write_page(
         _settings(experiment, panels),
     ]
     path.write_text("\n\n".join(part for part in parts if part) + "\n")
+
+
+def _panel_settings(panel: Panel) -> str:
+    changes = ", ".join(f"`{override}`" for override in panel.overrides)
+    return f"Here {changes}." if changes else ""
 
 
 def _conclusion(panel_runs: PanelRuns) -> str:
@@ -240,39 +247,32 @@ def _differences_table(panel_runs: PanelRuns) -> str:
 
 
 def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
-    panel = experiment.panels[0]
-    preset = experiment.preset_of(panel, panel.conditions[0], 0)
+    preset = load_preset(experiment.preset, (*experiment.overrides, *experiment.changes))
     schedule, optimiser = preset.schedule, preset.optimiser
     runs = [run for each in panels for runs in each.runs.values() for run in runs]
     followed = max((run.iterations for run in runs), default=0)
     made_on = " and ".join(sorted({run.compute for run in runs}))
     lines = [
-        f"* Preset `{preset.name}` ({preset.source}): eta {preset.algorithm.eta:g}, gamma "
-        f"{preset.algorithm.gamma:g}, M {schedule.episodes_per_iteration}, T "
-        f"{preset.task.horizon}, E {schedule.memory_samples}, N {schedule.target_switches}, U "
-        f"{schedule.epochs}, minibatches of {schedule.minibatch_size}, an update every "
-        f"{schedule.update_every}, {optimiser.name} {optimiser.learning_rate:g}; "
-        f"{followed} of {schedule.iterations} iterations; {made_on}.",
+        f"* Preset `{preset.name}` ({preset.source}), where a condition does not say otherwise: "
+        f"eta {preset.algorithm.eta:g}, gamma {preset.algorithm.gamma:g}, M "
+        f"{schedule.episodes_per_iteration}, T {preset.task.horizon}, E {schedule.memory_samples}, "
+        f"N {schedule.target_switches}, U {schedule.epochs}, minibatches of "
+        f"{schedule.minibatch_size}, an update every {schedule.update_every}, {optimiser.name} "
+        f"{optimiser.learning_rate:g}; {followed} of {schedule.iterations} iterations; {made_on}.",
         "* The area is the mean greedy return over the samples, by trapezia from the first point "
         f"to the last. Greedy episodes after each update: {experiment.episodes}.",
         "* Seeds are paired: initial weights, minibatches, demonstrations and the episodes' random "
         "numbers are derived from them. All runs are shown.",
         *(f"* {note}" for note in experiment.notes),
     ]
-    changes = [
-        f"`{override}`"
-        for override in (
-            *experiment.overrides,
-            *experiment.panels[0].overrides,
-            *experiment.changes,
-        )
-    ]
-    if changes:
+    if changes := [f"`{it}`" for it in (*experiment.overrides, *experiment.changes)]:
         lines.append(f"* Changed from the preset: {', '.join(changes)}.")
-    if any(it.start != "untrained" for each in experiment.panels for it in each.conditions):
+    rates = sorted({run.key.mistake_rate for run in runs if run.key.mistake_rate is not None})
+    if rates:
         lines.append(
-            f"* Demonstrations: the task's script, {experiment.mistake_rate:.0%} of its actions "
-            "random, drawn anew for each seed and the same for all conditions of it."
+            f"* Demonstrations: the task's script, {' or '.join(f'{rate:.0%}' for rate in rates)} "
+            "of its actions random, drawn anew for each seed and the same for all conditions of "
+            "it; they begin where a run's first episodes do."
         )
     return "\n".join(lines)
 

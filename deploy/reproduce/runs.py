@@ -12,16 +12,18 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from broker_config.durable import write_durably
 from broker_config.errors import MessageError, StorageError
+from broker_config.ownership import FileLock
 from broker_config.preset import Preset
 from broker_config.structure import from_plain, to_plain
 from deploy.process import end_with_parent, use_one_torch_thread
 from learner.compute import Compute
 
-Device = Literal["cpu", "cuda"]
+ON_CLONING: Final = "autograd on cpu"
+"""What clones are trained by, whatever learners are."""
 
 
 @dataclass(frozen=True)
@@ -131,25 +133,49 @@ def finish_runs(
         All runs asked for, in the order of `plans`.
 
     Raises:
+        AlreadyOwned: Another process makes runs in the work folder.
+        ClothbusError: A run has failed; all others were finished before.
         StorageError: The file cannot be read or written.
     """
-    finished = {run.key: run for run in read_runs(curves)}
     wanted = {plan.key: _iterations_of(plan, iterations) for plan in plans}
-    missing = [
-        plan
-        for plan in plans
-        if plan.key not in finished or finished[plan.key].iterations < wanted[plan.key]
-    ]
-    for run in _run_side_by_side(missing, work, compute, jobs, wanted):
-        finished[run.key] = run
-        write_runs(curves, finished.values())
+    whole = {plan.key: _iterations_of(plan, None) for plan in plans}
+    with FileLock(work / "reproduce.lock", f"experiment in {work}"):
+        finished = {run.key: run for run in read_runs(curves)}
+        missing = []
+        for plan in plans:
+            kept = finished.get(plan.key)
+            if kept is None or kept.iterations < wanted[plan.key]:
+                missing.append(plan)
+            elif kept.compute not in (str(compute), ON_CLONING):
+                sys.stderr.write(f"{plan.key.name}: kept as it is, by {kept.compute}\n")
+        errors: list[BaseException] = []
+        for run in _run_side_by_side(missing, work, compute, jobs, wanted, errors):
+            finished[run.key] = run
+            write_runs(curves, finished.values())
+            # Only now: whatever ends this process before, the run goes on from its last iteration.
+            if run.iterations >= whole[run.key]:
+                shutil.rmtree(checkpoints_folder(work, run.key), ignore_errors=True)
+    if errors:
+        raise errors[0]
     return [_up_to(finished[plan.key], wanted[plan.key]) for plan in plans]
 
 
-def finished_runs(plans: Sequence[RunPlan], curves: Path) -> list[FinishedRun]:
-    """Those of the runs that the file holds."""
+def finished_runs(
+    plans: Sequence[RunPlan], curves: Path, iterations: int | None
+) -> list[FinishedRun]:
+    """Those of the runs that the file holds, as far as `finish_runs` would follow them."""
     finished = {run.key: run for run in read_runs(curves)}
-    return [finished[plan.key] for plan in plans if plan.key in finished]
+    wanted = {plan.key: _iterations_of(plan, iterations) for plan in plans}
+    return [
+        _up_to(finished[key], n)
+        for key, n in wanted.items()
+        if key in finished and finished[key].iterations >= n
+    ]
+
+
+def checkpoints_folder(work: Path, key: RunKey) -> Path:
+    """Where an unfinished run keeps what it goes on from."""
+    return work / "checkpoints" / key.name
 
 
 def _iterations_of(plan: RunPlan, iterations: int | None) -> int:
@@ -169,19 +195,29 @@ def _run_side_by_side(
     compute: Compute,
     jobs: int,
     wanted: dict[RunKey, int],
+    errors: list[BaseException],
 ) -> Iterator[FinishedRun]:
+    """Yields each run when it is finished; a run that fails does not end the others."""
     # A process for each run, and spawned: CUDA does not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
     ) as pool:
-        futures = [pool.submit(_run, plan, work, compute, wanted[plan.key]) for plan in plans]
+        futures = {
+            pool.submit(_run, plan, work, compute, wanted[plan.key]): plan.key for plan in plans
+        }
         try:
             for number, future in enumerate(as_completed(futures), start=1):
-                sys.stderr.write(f"{number} of {len(futures)} runs finished\n")
-                yield future.result()
+                error = future.exception()
+                ending = "finished" if error is None else f"failed: {error}"
+                name = futures[future].name
+                sys.stderr.write(f"{number} of {len(futures)} runs: {name} {ending}\n")
+                if error is None:
+                    yield future.result()
+                else:
+                    errors.append(error)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # what has not begun does not begin
+            pool.shutdown(cancel_futures=True)  # what has not begun does not begin
             raise
 
 
@@ -192,11 +228,10 @@ def _run(plan: RunPlan, work: Path, compute: Compute, iterations: int) -> Finish
     with InProcessRun(plan, work, compute) as run:
         for point in run.finish(iterations):
             sys.stderr.write(f"{plan.key.name}: {_described(point)}\n")
-        finished = FinishedRun(plan.key, str(compute), tuple(run.points))
-        run.keep_policy()
-    if finished.iterations >= plan.preset.schedule.iterations:
-        shutil.rmtree(run.checkpoints_folder, ignore_errors=True)
-    return finished
+        if run.points[-1].iteration >= _iterations_of(plan, None):
+            run.keep_policy()
+        made_by = ON_CLONING if plan.key.start == "cloned" else str(compute)
+        return FinishedRun(plan.key, made_by, tuple(run.points))
 
 
 def _described(point: CurvePoint) -> str:

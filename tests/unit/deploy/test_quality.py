@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,11 +33,14 @@ def test_processes_do_not_change_what_is_found() -> None:
 def test_a_quality_is_measured_once_and_kept(tmp_path: Path) -> None:
     first = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
     path = tmp_path / "demos" / QUALITY_FILE
-    path.write_text(path.read_text().replace('"episodes": 6', '"episodes": 7'))
+    path.write_text(path.read_text().replace('"measured": ', '"measured": 1'))  # as nobody would
     again = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
-    assert (again.mistake_rate, again.episodes) == (first.mistake_rate, 7)
-    with pytest.raises(StorageError, match=r"expected quality 0\.6; got one of 0\.5"):
-        kept_quality(tmp_path / "demos", TASK, 0.6, 6)
+    assert again.mistake_rate == first.mistake_rate
+    assert again.measured != first.measured
+    other_task = replace(TASK, horizon=TASK.horizon + 1)
+    for wanted, episodes, task in ((0.6, 6, TASK), (0.5, 7, TASK), (0.5, 6, other_task)):
+        with pytest.raises(StorageError, match=f"expected quality {wanted} over {episodes}"):
+            kept_quality(tmp_path / "demos", task, wanted, episodes)
     path.write_text("{}")
     with pytest.raises(StorageError, match="expected a quality; got"):
         kept_quality(tmp_path / "demos", TASK, 0.5, 6)
@@ -45,3 +49,7 @@ def test_a_quality_is_measured_once_and_kept(tmp_path: Path) -> None:
 def test_what_is_no_quality_is_refused() -> None:
     with pytest.raises(PresetError, match=r"expected 0 \(chance\) to 1 \(the script\); got 1\.5"):
         find_quality(TASK, 1.5, 2)
+    with pytest.raises(PresetError, match="quality_episodes: expected at least 1; got 0"):
+        find_quality(TASK, 0.5, 0)
+    with pytest.raises(PresetError, match="jobs: expected at least 1; got 0"):
+        find_quality(TASK, 0.5, 2, jobs=0)

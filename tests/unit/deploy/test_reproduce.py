@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from actors.policy import Policy
-from broker_config.errors import PresetError, StorageError
+from broker_config.errors import AlreadyOwned, PresetError, StorageError
 from broker_config.messages import Trajectory
+from broker_config.ownership import FileLock
 from broker_config.preset import Preset
 from deploy.presets import preset_names
 from deploy.reproduce import command
@@ -20,18 +21,23 @@ from deploy.reproduce.catalogue import EXPERIMENTS, find
 from deploy.reproduce.chapter3 import DPN, DQN, DUELING_DPN, SUPERVISED
 from deploy.reproduce.chapter4 import BID, CLONING, QGAIL
 from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
+from deploy.reproduce.demonstrations import LEAST_TARGETS, demonstrations_of
 from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
 from deploy.reproduce.in_process_run import InProcessRun, policy_file
 from deploy.reproduce.runs import (
     CurvePoint,
     FinishedRun,
     RunPlan,
+    checkpoints_folder,
     finish_runs,
+    finished_runs,
     read_runs,
     write_runs,
 )
+from discriminator.real_states import real_states
 from learner.cloning import cloning_preset
-from learner.compute import ON_CPU
+from learner.compute import ON_CPU, Compute
+from learner.recorded import first_samples
 
 torch.set_num_threads(1)  # as the runs' own processes have
 
@@ -65,6 +71,7 @@ IMITATION = Experiment(
         "imitation.demonstration_samples=40",
         "imitation.discriminator.minibatch_size=16",
         "imitation.generator_epochs=2",
+        "schedule.epochs=1",
         "imitation.target_reward=-0.5",
     ),
 )
@@ -125,7 +132,7 @@ def test_what_is_finished_is_not_run_again_and_goes_on_when_more_is_asked_for(
     assert second.points[:2] == first.points
     (again,) = finish_runs(plans, curves, tmp_path / "nowhere", ON_CPU, 1, iterations=1)
     assert again == first
-    assert not (tmp_path / "nowhere").exists()
+    assert not (tmp_path / "nowhere" / "checkpoints").exists()
 
 
 def test_conditions_get_equal_samples_and_gradient_steps(tmp_path: Path) -> None:
@@ -139,8 +146,7 @@ def test_conditions_get_equal_samples_and_gradient_steps(tmp_path: Path) -> None
 
 def test_demonstrations_are_the_same_for_all_conditions_of_a_seed(tmp_path: Path) -> None:
     def demonstrations(condition: Condition, seed: int) -> list[Trajectory]:
-        with InProcessRun(smoke_plan(condition, seed), tmp_path) as run:
-            return run._demonstrations()
+        return demonstrations_of(smoke_plan(condition, seed), tmp_path)
 
     mine, theirs = demonstrations(INITIALISED, 0), demonstrations(SUPERVISED, 0)
     assert sum(each.steps for each in mine) == 15  # a last trajectory is cut to fit
@@ -158,7 +164,7 @@ def test_a_cloned_policy_does_what_was_demonstrated(tmp_path: Path) -> None:
     with InProcessRun(plan, tmp_path) as run:
         (point,) = run.finish(0)
         run.keep_policy()
-        demonstrations = run._demonstrations()
+    demonstrations = demonstrations_of(plan, tmp_path)
     assert (point.iteration, point.samples) == (0, 0)
     assert point.gradient_steps == 60 * 2
     weights = policy_file(tmp_path, plan).read_bytes()
@@ -199,6 +205,83 @@ def test_imitation_learns_from_the_discriminators_rewards_alone(tmp_path: Path) 
         rewards = discriminators.rewards(memory.states_after())
     assert torch.equal(memory.samples.rewards, rewards)
     assert len(rewards) == 60
+
+
+def test_a_run_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
+    good = smoke_plan()
+    lagging = with_changes(SMOKE, 1, ["schedule.policy_lag=1"])
+    bad = lagging.plan(SMOKE.panels[0], DPN, 0)
+    curves = tmp_path / "curves.jsonl"
+    with pytest.raises(ValueError, match=r"expected schedule\.policy_lag 0"):
+        finish_runs([bad, good], curves, tmp_path / "work", ON_CPU, 1, iterations=1)
+    (kept,) = read_runs(curves)
+    assert (kept.key, kept.iterations) == (good.key, 1)
+    assert checkpoints_folder(tmp_path / "work", good.key).exists()  # it may go on
+    finish_runs([good], curves, tmp_path / "work", ON_CPU, 1, iterations=None)
+    assert not checkpoints_folder(tmp_path / "work", good.key).exists()
+
+
+def test_two_commands_do_not_write_over_each_other(tmp_path: Path) -> None:
+    with (
+        FileLock(tmp_path / "work" / "reproduce.lock", "another"),
+        pytest.raises(AlreadyOwned, match="experiment in"),
+    ):
+        finish_runs([smoke_plan()], tmp_path / "c.jsonl", tmp_path / "work", ON_CPU, 1, None)
+
+
+def test_a_run_does_not_go_on_by_another_path(tmp_path: Path) -> None:
+    with InProcessRun(smoke_plan(), tmp_path) as begun:
+        next(begun.finish())
+    with pytest.raises(StorageError, match=r"go on by reference steps on cpu.*got products steps"):
+        InProcessRun(smoke_plan(), tmp_path, Compute(path="products"))
+
+
+def test_demonstrations_to_imitate_show_enough_targets(tmp_path: Path) -> None:
+    """Those that do not are drawn anew; all conditions get the same."""
+    few = with_changes(IMITATION, 3, ["imitation.target_reward=-0.12"])
+    for seed in range(3):
+        plans = [few.plan(few.panels[0], condition, seed) for condition in (BID, CLONING)]
+        mine, theirs = (demonstrations_of(plan, tmp_path) for plan in plans)
+        assert len(real_states(mine, -0.12)["target"]) >= LEAST_TARGETS
+        assert [it.actions.tolist() for it in mine] == [it.actions.tolist() for it in theirs]
+    never = with_changes(IMITATION, 1, ["imitation.target_reward=0.0"])
+    with pytest.raises(StorageError, match="expected at least 3 target states"):
+        demonstrations_of(never.plan(never.panels[0], BID, 0), tmp_path)
+
+
+def test_what_was_cut_off_has_not_succeeded(tmp_path: Path) -> None:
+    (whole, *_) = demonstrations_of(smoke_plan(INITIALISED), tmp_path)
+    succeeded = replace(whole, success=True)
+    (cut,) = first_samples([succeeded], whole.steps - 1)
+    assert (cut.steps, cut.success, cut.terminated) == (whole.steps - 1, False, False)
+    (kept,) = first_samples([succeeded], whole.steps)
+    assert kept == succeeded
+
+
+def test_runs_that_were_not_followed_so_far_are_not_drawn(tmp_path: Path) -> None:
+    curves = tmp_path / "curves.jsonl"
+    longer, shorter = run_of(DPN, 0, [1.0, 2.0, 3.0]), run_of(DPN, 1, [4.0, 5.0])
+    write_runs(curves, [longer, shorter])
+    plans = [smoke_plan(DPN, seed) for seed in (0, 1)]
+    assert finished_runs(plans, curves, None) == [longer]
+    both = finished_runs(plans, curves, 1)
+    assert [run.iterations for run in both] == [1, 1]
+    draw(replace(SMOKE, panels=(Panel("p", (DPN,), 2),)), both, tmp_path, "command")
+
+
+def test_the_page_says_what_each_panel_has(tmp_path: Path) -> None:
+    panels = (
+        Panel("few mistakes", (INITIALISED,), 1, ("algorithm.eta=2.0",), mistake_rate=0.1),
+        Panel("many mistakes", (INITIALISED,), 1, mistake_rate=0.7),
+    )
+    experiment = replace(SMOKE, panels=panels)
+    points = run_of(DPN, 0, [1.0, 2.0]).points
+    runs = [FinishedRun(experiment.plan(it, INITIALISED, 0).key, "x", points) for it in panels]
+    draw(experiment, runs, tmp_path, "the command")
+    page = (tmp_path / PAGE).read_text()
+    assert "10% or 70% of its actions random" in page
+    assert "## few mistakes\n\nHere `algorithm.eta=2.0`.\n" in page
+    assert "where a condition does not say otherwise: eta 1," in page
 
 
 def test_a_policy_lag_is_refused(tmp_path: Path) -> None:
