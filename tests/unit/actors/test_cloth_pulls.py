@@ -96,18 +96,23 @@ def test_cloth_that_leaves_the_picture_is_told_from_cloth_within() -> None:
     assert touches_border(cloth_mask(picture(shifted(0.15, 0.0))))
 
 
-def test_turning_carries_the_rear_end_over_and_back_from_too_far() -> None:
-    over = turning_pull(picture(SHEET.vertices_m), (20.0, 60.0))
-    assert over.drop_px == pytest.approx((20.0, 60.0))
-    assert over.pick_px[0] > 42 > over.pick_px[1]
-    back = turning_pull(picture(shifted(-0.1, -0.1)), (20.0, 60.0))
-    assert back.drop_px == pytest.approx((64.0, 24.0))
+@pytest.mark.parametrize(
+    ("towards", "drop_px"), list(enumerate([(0.0, 0.0), (84.0, 0.0), (0.0, 84.0), (84.0, 84.0)]))
+)
+def test_turning_carries_the_farthest_end_to_a_corner_of_the_picture(
+    towards: int, drop_px: tuple[float, float]
+) -> None:
+    pull = turning_pull(cloth_mask(picture(SHEET.vertices_m)), towards)
+    assert pull.drop_px == drop_px
+    half_px = 0.15 * Camera().px_per_m
+    opposite_px = 42 - half_px * np.sign(np.array(drop_px) - 42)
+    assert pull.pick_px == pytest.approx(opposite_px, abs=4)
 
 
 def test_pictures_that_will_not_do_are_refused() -> None:
     for find in (
         lambda: spreading_pulls(EMPTY, 2000),
-        lambda: turning_pull(EMPTY, (20.0, 60.0)),
+        lambda: turning_pull(cloth_mask(EMPTY), 0),
         lambda: centring_pull(cloth_mask(EMPTY), (42.0, 42.0)),
     ):
         with pytest.raises(NoClothInViewError, match="expected at least one pixel of cloth"):
