@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.cloth.masks import cloth_mask, red_mask
+from actors.cloth.masks import Side, cloth_mask, side_masks
 from actors.cloth.pick_points import NoClothInViewError
 
 RIM: Final = 2 / 84
@@ -77,12 +77,13 @@ class Pull:
     """The area that it may bring, less what speaks against it."""
 
 
-def spreading_pulls(picture: NDArray[np.uint8], flat_px: int) -> list[Pull]:
+def spreading_pulls(picture: NDArray[np.uint8], flat_px: int, up: Side | None = None) -> list[Pull]:
     """All pulls that may bring area.
 
     Args:
         picture: u8[H, H, 3].
         flat_px: pixels that the spread garment covers in it.
+        up: the side that is to be up in the end; None where either will do.
 
     Raises:
         ValueError: it is not such a picture.
@@ -91,8 +92,9 @@ def spreading_pulls(picture: NDArray[np.uint8], flat_px: int) -> list[Pull]:
     mask = cloth_mask(picture)
     _check_any(mask)
     hidden_px = max(0, flat_px - int(mask.sum()))
-    red = red_mask(picture)
-    patches = [patch for side in (red, mask & ~red) for patch in _patches(side)]
+    # A flap that shows the right side would show the wrong one when opened.
+    to_open = [seen for side, seen in side_masks(picture).items() if side != up]
+    patches = [patch for seen in to_open for patch in _patches(seen)]
     unfolding = [pull for patch in patches for pull in _unfolding(patch, mask, hidden_px)]
     return unfolding + _stretching(mask, flat_px, hidden_px)
 

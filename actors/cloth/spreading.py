@@ -8,13 +8,13 @@ whichever side is up, unless one is asked for; then it is turned over where need
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.masks import cloth_mask, red_mask
+from actors.cloth.masks import Side, cloth_mask, side_masks
 from actors.cloth.measures import normalised_coverage
 from actors.cloth.pick_points import NoClothInViewError
 from actors.cloth.pulls import (
@@ -27,9 +27,6 @@ from actors.cloth.pulls import (
 )
 
 Point = tuple[float, float]
-Side = Literal["green", "red"]
-"""Of the handkerchief: its front is green, its back red."""
-
 OnPull = Callable[[Pull, Camera], None]
 """Takes a pull and the camera in whose pixels it speaks."""
 
@@ -180,7 +177,9 @@ class SpreadingRule:
         elif is_spread:
             return None
         else:
-            chosen = self._most_promising(spreading_pulls(picture, self.flat_px), coverage)
+            chosen = self._most_promising(
+                spreading_pulls(picture, self.flat_px, self.aim.up), coverage
+            )
         chosen = self._within_reach(chosen)
         self._last = chosen
         return chosen
@@ -193,9 +192,8 @@ class SpreadingRule:
 
     def _is_wrong_side_up(self, picture: NDArray[np.uint8]) -> bool:
         """Whether the picture shows more of the side that must not be up."""
-        red_px, cloth_px = int(red_mask(picture).sum()), int(cloth_mask(picture).sum())
-        wrong_px = {None: 0, "red": cloth_px - red_px, "green": red_px}[self.aim.up]
-        return 2 * wrong_px > cloth_px
+        seen_px = {side: int(seen.sum()) for side, seen in side_masks(picture).items()}
+        return self.aim.up is not None and 2 * seen_px[self.aim.up] < sum(seen_px.values())
 
     def _pixel(self, xy_m: Point) -> Point:
         x, y = self.camera.project_px(np.array([*xy_m, 0.0])).tolist()

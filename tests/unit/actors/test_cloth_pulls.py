@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from actors.cloth.camera import Camera
-from actors.cloth.masks import cloth_mask
+from actors.cloth.masks import Side, cloth_mask, side_masks
 from actors.cloth.meshes import rectangular_sheet
 from actors.cloth.pick_points import NoClothInViewError
 from actors.cloth.pulls import (
@@ -72,6 +72,20 @@ def test_the_ends_of_shrunken_cloth_are_pulled_outwards() -> None:
         pick, drop = np.array(pull.pick_px) - 42, np.array(pull.drop_px) - 42
         assert np.linalg.norm(drop) > np.linalg.norm(pick) + 5
         assert drop @ pick > 0.95 * np.linalg.norm(drop) * np.linalg.norm(pick)
+
+
+@pytest.mark.parametrize(("up", "is_opened"), [(None, True), ("green", True), ("red", False)])
+def test_a_flap_that_shows_the_side_asked_for_is_not_opened(
+    up: Side | None, is_opened: bool
+) -> None:
+    seen = picture(folded(0.06))
+    flap = side_masks(seen)["red"]
+    opening = [
+        pull
+        for pull in spreading_pulls(seen, flat_px(Camera()), up)
+        if pull.kind is PullKind.UNFOLD and flap[int(pull.pick_px[1]), int(pull.pick_px[0])]
+    ]
+    assert bool(opening) is is_opened
 
 
 def test_every_pick_point_lies_on_cloth() -> None:
