@@ -16,11 +16,11 @@ from PIL import Image
 from rich.table import Table
 
 from actors.cloth.camera import Camera
-from actors.cloth.masks import cloth_mask, red_mask
+from actors.cloth.masks import Side, cloth_mask, red_mask
 from actors.cloth.measures import FAR_ABOVE, true_coverage
 from actors.cloth.pulls import Pull
 from actors.cloth.rasteriser import draw_cloth
-from actors.cloth.spreading import Side, SpreadAim, SpreadEnd
+from actors.cloth.spreading import SpreadAim, SpreadEnd
 from actors.envs import ClothTaskEnv, make_env
 from actors.envs.initial_states import check_initial_state
 from deploy.played_episodes import mapped

@@ -3,8 +3,13 @@
 The same functions serve a real camera over a nearly grey table: nothing here knows the simulator.
 """
 
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
+
+Side = Literal["green", "red"]
+"""Of the handkerchief: its front is green, its back red."""
 
 # Largest less smallest channel. The drawn table has 20; the drawn cloth, in its darkest shade, 58.
 LEAST_SATURATION = 40
@@ -29,6 +34,16 @@ def red_mask(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
     """
     red_strongest: NDArray[np.bool_] = picture.argmax(axis=2) == 0
     return cloth_mask(picture) & red_strongest
+
+
+def side_masks(picture: NDArray[np.uint8]) -> dict[Side, NDArray[np.bool_]]:
+    """Where the picture shows which side of the cloth, bool[H, W], for a picture u8[H, W, 3].
+
+    Raises:
+        ValueError: it is not such a picture.
+    """
+    red = red_mask(picture)
+    return {"red": red, "green": cloth_mask(picture) & ~red}
 
 
 def _check_picture(picture: NDArray[np.uint8]) -> None:

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.cloth.masks import cloth_mask, red_mask
-from actors.cloth.pick_points import NoClothInViewError, grid_pick_points
+from actors.cloth.masks import Side, cloth_mask, side_masks
+from actors.cloth.pick_points import NoClothInViewError
 
 RIM: Final = 2 / 84
 """Portion of the picture's width that is no more than a rim: outlines are that exact."""
@@ -37,9 +37,6 @@ rim instead of its middle, and for a fold half a picture away."""
 
 STRETCH: Final = 0.35
 """Portion of the hidden area that pulling an end outwards may bring at best."""
-
-TOO_FAR: Final = 1 / 6
-"""Portion of the picture's width by which cloth that is turned may be off the middle."""
 
 STRETCH_BEYOND: Final = 0.05
 """So far an end is pulled beyond where it belongs, in diagonals of half the spread square."""
@@ -61,7 +58,7 @@ class PullKind(StrEnum):
     """Pull an end away from the cloth's centroid."""
 
     TURN = "turn"
-    """Roll the cloth over, or pull it out of its roll."""
+    """Carry an end over the whole of the cloth."""
 
     CENTRE = "centre"
     """Pull the whole cloth towards the picture's middle."""
@@ -80,12 +77,13 @@ class Pull:
     """The area that it may bring, less what speaks against it."""
 
 
-def spreading_pulls(picture: NDArray[np.uint8], flat_px: int) -> list[Pull]:
+def spreading_pulls(picture: NDArray[np.uint8], flat_px: int, up: Side | None = None) -> list[Pull]:
     """All pulls that may bring area.
 
     Args:
         picture: u8[H, H, 3].
         flat_px: pixels that the spread garment covers in it.
+        up: the side that is to be up in the end; None where either will do.
 
     Raises:
         ValueError: it is not such a picture.
@@ -94,8 +92,9 @@ def spreading_pulls(picture: NDArray[np.uint8], flat_px: int) -> list[Pull]:
     mask = cloth_mask(picture)
     _check_any(mask)
     hidden_px = max(0, flat_px - int(mask.sum()))
-    red = red_mask(picture)
-    patches = [patch for side in (red, mask & ~red) for patch in _patches(side)]
+    # A flap that shows the right side would show the wrong one when opened.
+    to_open = [seen for side, seen in side_masks(picture).items() if side != up]
+    patches = [patch for seen in to_open for patch in _patches(seen)]
     unfolding = [pull for patch in patches for pull in _unfolding(patch, mask, hidden_px)]
     return unfolding + _stretching(mask, flat_px, hidden_px)
 
@@ -115,26 +114,23 @@ def centring_pull(mask: NDArray[np.bool_], middle_px: tuple[float, float]) -> Pu
     return Pull(PullKind.CENTRE, _pair(pick), _pair(pick + FOLLOWS * way), 0.0)
 
 
-def turning_pull(picture: NDArray[np.uint8], towards_px: tuple[float, float]) -> Pull:
-    """Carry the cloth's rear end over it, or back where the cloth has come too far.
+def turning_pull(mask: NDArray[np.bool_], towards: int) -> Pull:
+    """Carry the end of spread cloth, bool[H, H], over all the rest of it, so that it turns over.
 
-    So it is rolled over bit by bit, and spreads when it is pulled back.
+    The way leads to a corner of the picture, where it is longest: the end then lies beyond the one
+    that it was carried over, and the more so, the more of the cloth has turned.
 
     Args:
-        picture: u8[H, H, 3].
-        towards_px: whereto, from the picture's middle; back is as far on the other side.
+        mask: where the cloth is.
+        towards: which of the picture's 4 corners.
 
     Raises:
-        ValueError: it is not such a picture.
-        NoClothInViewError: it shows no cloth.
+        NoClothInViewError: there is no cloth.
     """
-    half = len(picture) / 2
-    way = np.array(towards_px) - half
-    forward = way / np.linalg.norm(way)
-    picks = grid_pick_points(picture) + 0.5
-    advance_px = float((_places(cloth_mask(picture)).mean(axis=0) - half) @ forward)
-    drop = half + (-way if advance_px > TOO_FAR * len(picture) else way)
-    return Pull(PullKind.TURN, _pair(picks[(picks @ forward).argmin()]), _pair(drop), 0.0)
+    _check_any(mask)
+    drop = float(len(mask)) * np.array([towards % 2, towards // 2], dtype=np.float64)
+    pick = max(_corners(mask), key=lambda corner: float(np.linalg.norm(corner - drop)))
+    return Pull(PullKind.TURN, _pair(pick), _pair(drop), 0.0)
 
 
 def touches_border(mask: NDArray[np.bool_]) -> bool:

@@ -2,19 +2,19 @@
 
 Source: chapter 5.2.2, which wishes for one. Neither policy nor simulator: what is known is the
 camera's picture, the camera, and how much the spread garment covers. The cloth counts as spread
-whichever side is up, unless one is asked for; then it is rolled over where need be.
+whichever side is up, unless one is asked for; then it is turned over where need be.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
-from actors.cloth.masks import cloth_mask, red_mask
+from actors.cloth.masks import Side, cloth_mask, side_masks
 from actors.cloth.measures import normalised_coverage
 from actors.cloth.pick_points import NoClothInViewError
 from actors.cloth.pulls import (
@@ -27,9 +27,6 @@ from actors.cloth.pulls import (
 )
 
 Point = tuple[float, float]
-Side = Literal["green", "red"]
-"""Of the handkerchief: its front is green, its back red."""
-
 OnPull = Callable[[Pull, Camera], None]
 """Takes a pull and the camera in whose pixels it speaks."""
 
@@ -50,15 +47,6 @@ LUCK: Final = 0.05
 more: it first decides between equal promises, then leads out of a circle."""
 
 MOST_LUCK: Final = 0.3
-
-TURN_TOWARDS_M: Final = (0.12, 0.09)
-"""Whereto cloth is rolled that lies on the wrong side; the signs are drawn."""
-
-TURNED: Final = 0.8
-"""Portion of the flat area that shows the right side, from which on spreading does the rest."""
-
-MOST_TURNS: Final = 8
-"""Pulls to turn the cloth over, before it is spread again and turned anew."""
 
 
 class TableLostError(RuntimeError):
@@ -164,8 +152,6 @@ class SpreadingRule:
 
     aim: SpreadAim = field(default_factory=SpreadAim)
     _best: float = field(default=0.0, init=False)
-    _turns_left: int = field(default=0, init=False)
-    _turn_towards_m: Point = field(default=TURN_TOWARDS_M, init=False)
     _last: Pull | None = field(default=None, init=False)
     _in_vain: list[Pull] = field(default_factory=list, init=False)
 
@@ -183,14 +169,17 @@ class SpreadingRule:
         coverage = normalised_coverage(mask, self.flat_px)
         self._remember(coverage)
         is_spread = coverage >= self.aim.coverage
-        if self._must_turn(is_spread, normalised_coverage(self._right(picture), self.flat_px)):
-            chosen = turning_pull(picture, self._pixel(self._turn_towards_m))
+        if is_spread and self._is_wrong_side_up(picture):
+            self._best, self._in_vain = 0.0, []
+            chosen = turning_pull(mask, int(self.random.integers(4)))
         elif touches_border(mask) or (is_spread and not self._is_centred(mask)):
             chosen = centring_pull(mask, self._pixel((0.0, 0.0)))
         elif is_spread:
             return None
         else:
-            chosen = self._most_promising(spreading_pulls(picture, self.flat_px), coverage)
+            chosen = self._most_promising(
+                spreading_pulls(picture, self.flat_px, self.aim.up), coverage
+            )
         chosen = self._within_reach(chosen)
         self._last = chosen
         return chosen
@@ -201,20 +190,10 @@ class SpreadingRule:
         elif self._last is not None and self._last.kind in (PullKind.UNFOLD, PullKind.STRETCH):
             self._in_vain.append(self._last)
 
-    def _must_turn(self, is_spread: bool, right_portion: float) -> bool:
-        self._turns_left = max(0, self._turns_left - 1) if right_portion < TURNED else 0
-        if is_spread and right_portion < TURNED and self._turns_left == 0:
-            self._turns_left = MOST_TURNS
-            signs = self.random.choice([-1.0, 1.0], 2)
-            self._turn_towards_m = (signs[0] * TURN_TOWARDS_M[0], signs[1] * TURN_TOWARDS_M[1])
-        if self._turns_left > 0:
-            self._best, self._in_vain = 0.0, []
-        return self._turns_left > 0
-
-    def _right(self, picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Where the picture shows cloth with the right side up."""
-        mask, red = cloth_mask(picture), red_mask(picture)
-        return {None: mask, "red": red, "green": mask & ~red}[self.aim.up]
+    def _is_wrong_side_up(self, picture: NDArray[np.uint8]) -> bool:
+        """Whether the picture shows more of the side that must not be up."""
+        seen_px = {side: int(seen.sum()) for side, seen in side_masks(picture).items()}
+        return self.aim.up is not None and 2 * seen_px[self.aim.up] < sum(seen_px.values())
 
     def _pixel(self, xy_m: Point) -> Point:
         x, y = self.camera.project_px(np.array([*xy_m, 0.0])).tolist()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from actors.cloth.camera import Camera
-from actors.cloth.masks import cloth_mask
+from actors.cloth.masks import Side, cloth_mask, side_masks
 from actors.cloth.meshes import rectangular_sheet
 from actors.cloth.pick_points import NoClothInViewError
 from actors.cloth.pulls import (
@@ -74,6 +74,20 @@ def test_the_ends_of_shrunken_cloth_are_pulled_outwards() -> None:
         assert drop @ pick > 0.95 * np.linalg.norm(drop) * np.linalg.norm(pick)
 
 
+@pytest.mark.parametrize(("up", "is_opened"), [(None, True), ("green", True), ("red", False)])
+def test_a_flap_that_shows_the_side_asked_for_is_not_opened(
+    up: Side | None, is_opened: bool
+) -> None:
+    seen = picture(folded(0.06))
+    flap = side_masks(seen)["red"]
+    opening = [
+        pull
+        for pull in spreading_pulls(seen, flat_px(Camera()), up)
+        if pull.kind is PullKind.UNFOLD and flap[int(pull.pick_px[1]), int(pull.pick_px[0])]
+    ]
+    assert bool(opening) is is_opened
+
+
 def test_every_pick_point_lies_on_cloth() -> None:
     seen = picture(folded(0.03))
     mask = cloth_mask(seen)
@@ -96,18 +110,23 @@ def test_cloth_that_leaves_the_picture_is_told_from_cloth_within() -> None:
     assert touches_border(cloth_mask(picture(shifted(0.15, 0.0))))
 
 
-def test_turning_carries_the_rear_end_over_and_back_from_too_far() -> None:
-    over = turning_pull(picture(SHEET.vertices_m), (20.0, 60.0))
-    assert over.drop_px == pytest.approx((20.0, 60.0))
-    assert over.pick_px[0] > 42 > over.pick_px[1]
-    back = turning_pull(picture(shifted(-0.1, -0.1)), (20.0, 60.0))
-    assert back.drop_px == pytest.approx((64.0, 24.0))
+@pytest.mark.parametrize(
+    ("towards", "drop_px"), list(enumerate([(0.0, 0.0), (84.0, 0.0), (0.0, 84.0), (84.0, 84.0)]))
+)
+def test_turning_carries_the_farthest_end_to_a_corner_of_the_picture(
+    towards: int, drop_px: tuple[float, float]
+) -> None:
+    pull = turning_pull(cloth_mask(picture(SHEET.vertices_m)), towards)
+    assert pull.drop_px == drop_px
+    half_px = 0.15 * Camera().px_per_m
+    opposite_px = 42 - half_px * np.sign(np.array(drop_px) - 42)
+    assert pull.pick_px == pytest.approx(opposite_px, abs=4)
 
 
 def test_pictures_that_will_not_do_are_refused() -> None:
     for find in (
         lambda: spreading_pulls(EMPTY, 2000),
-        lambda: turning_pull(EMPTY, (20.0, 60.0)),
+        lambda: turning_pull(cloth_mask(EMPTY), 0),
         lambda: centring_pull(cloth_mask(EMPTY), (42.0, 42.0)),
     ):
         with pytest.raises(NoClothInViewError, match="expected at least one pixel of cloth"):

@@ -9,7 +9,7 @@ from actors.cloth.engines import make_engine
 from actors.cloth.garments import make_garment
 from actors.cloth.gestures import pick_and_drop
 from actors.cloth.grasps import grasped_vertices
-from actors.cloth.masks import cloth_mask
+from actors.cloth.masks import cloth_mask, red_mask
 from actors.cloth.measures import true_coverage
 from actors.cloth.pick_points import NoClothInViewError
 from actors.cloth.pulls import PullKind
@@ -148,6 +148,18 @@ def test_the_wrong_side_is_turned_where_one_is_asked_for() -> None:
     assert pull is not None
     assert pull.kind is PullKind.TURN
     assert rule(up="red").next_pull(turned) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cloth_is_turned_over_and_spread_in_ten_actions(seed: int) -> None:
+    table = SimulatedTable()
+    random = np.random.default_rng(seed)
+    outcome = spread(table, CAMERA, FLAT_PX, random, SpreadAim(up="red", actions=10))
+    assert outcome.end is SpreadEnd.SPREAD
+    assert table.coverage() > 0.9
+    seen = table.look()
+    assert red_mask(seen).sum() == cloth_mask(seen).sum()
+    table.engine.close()
 
 
 @pytest.mark.parametrize("shift_m", [0.07, 0.14])
