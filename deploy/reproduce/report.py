@@ -31,6 +31,9 @@ _AXIS_LABELS: dict[Measure, str] = {
     "relative_bellman_errors": "Bellman error / std(V)",
 }
 _PANEL_INCHES = (5.2, 3.4)
+_LEAST_SEEDS = 3
+"""With fewer the page says which is ahead, and draws no conclusion."""
+_ONE_SEED = "needs two seeds"
 
 
 @dataclass(frozen=True)
@@ -186,12 +189,19 @@ def _conclusion(panel_runs: PanelRuns) -> str:
         difference = panel_runs.difference(other)
         if difference is None:
             continue
+        n_seeds = len(difference.differences)
+        if n_seeds < _LEAST_SEEDS:
+            sentences.append(
+                f"{panel_runs.subject.label}'s area under the curve minus {other.label}'s is "
+                f"{difference.mean:+.2f}, which with seeds as few as {n_seeds} tells nothing yet."
+            )
+            continue
         low, high = difference.bootstrap
         verdict = "above" if low > 0 else "below" if high < 0 else "not told apart from"
         sentences.append(
             f"{panel_runs.subject.label}'s area under the curve is {verdict} {other.label}'s: the "
             f"mean paired difference is {difference.mean:+.2f}, with a 95 % interval from "
-            f"{low:+.2f} to {high:+.2f} (bootstrap over {len(difference.differences)} seeds)."
+            f"{low:+.2f} to {high:+.2f} (bootstrap over {n_seeds} seeds)."
         )
     return "\n".join(sentences)
 
@@ -223,6 +233,8 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
 
 
 def _mean_and_interval(values: Sequence[float], form: str) -> list[str]:
+    if len(values) == 1:
+        return [form.format(values[0]), _ONE_SEED]
     low, high = bootstrap_interval(np.asarray(values))
     return [form.format(np.mean(values)), f"{form.format(low)} to {form.format(high)}"]
 
@@ -239,8 +251,8 @@ def _differences_table(panel_runs: PanelRuns) -> str:
                 f"{panel_runs.subject.label} - {other.label}",
                 ", ".join(f"{value:+.2f}" for value in difference.differences),
                 f"{difference.mean:+.2f}",
-                _interval(difference.bootstrap),
-                "needs two seeds" if difference.t is None else _interval(difference.t),
+                _ONE_SEED if difference.t is None else _interval(difference.bootstrap),
+                _ONE_SEED if difference.t is None else _interval(difference.t),
             ]
         )
     return _table(header, rows) if rows else ""

@@ -269,6 +269,16 @@ def test_runs_that_were_not_followed_so_far_are_not_drawn(tmp_path: Path) -> Non
     draw(replace(SMOKE, panels=(Panel("p", (DPN,), 2),)), both, tmp_path, "command")
 
 
+def test_a_single_seed_tells_nothing_yet(tmp_path: Path) -> None:
+    experiment = replace(SMOKE, panels=(Panel("2 joints", (DPN, DQN), seeds=1),))
+    draw(experiment, [run_of(DPN, 0, [2.0, 2.0]), run_of(DQN, 0, [1.0, 1.0])], tmp_path, "command")
+    page = (tmp_path / PAGE).read_text()
+    assert "minus DQN's is +1.00, which with seeds as few as 1 tells nothing yet." in page
+    assert "is above" not in page
+    assert "| DPN - DQN | +1.00 | +1.00 | needs two seeds | needs two seeds |" in page
+    assert "| DPN | 1 | 2.00 | needs two seeds |" in page
+
+
 def test_the_page_says_what_each_panel_has(tmp_path: Path) -> None:
     panels = (
         Panel("few mistakes", (INITIALISED,), 1, ("algorithm.eta=2.0",), mistake_rate=0.1),
