@@ -338,6 +338,7 @@ def evaluate(
     """
     from deploy.evaluate import evaluate as evaluate_versions
     from deploy.evaluate import evaluate_on_stored_states, score_table, stored_score_table
+    from deploy.evaluation import modes_of
     from deploy.run_folder import RunFolder
 
     if episodes is not None:
@@ -349,8 +350,7 @@ def evaluate(
             f"{', '.join(initial_states)}; name a file of states"
         )
     run_folder = RunFolder(folder)
-    is_dqn = run_folder.read_preset().algorithm.is_epsilon_greedy
-    chosen = mode or ("greedy" if is_dqn else "sampled")
+    chosen = mode or modes_of(run_folder.read_preset().algorithm)[0]
     if stored_states is None:
         table = score_table(evaluate_versions(run_folder, versions, episodes or 100, chosen, jobs))
     else:

@@ -80,7 +80,7 @@ class Score:
 
 
 def modes_of(algorithm: AlgorithmPreset) -> tuple[Mode, ...]:
-    """The ways in which a method's policy can act; Q has no softmax policy."""
+    """The ways in which a method's policy can act, the usual one first; Q has no softmax policy."""
     return ("greedy",) if algorithm.is_epsilon_greedy else ("sampled", "greedy")
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Final
 
 from actors.demonstrate.acting import scripted_demonstrator
-from actors.envs import FoldLinesEnv, make_env
+from actors.envs import FoldLinesEnv
+from actors.task import make_task_env
 from broker_config.durable import write_durably
 from broker_config.errors import MessageError, PresetError, StorageError
 from broker_config.preset import TaskPreset
@@ -44,8 +45,8 @@ class Quality:
     script_score: float
     episodes: int
     """By which each rate was measured."""
-    task: Mapping[str, str]
-    """The task's settings, as text."""
+    task: TaskPreset
+    """That was played."""
 
     def __str__(self) -> str:
         return (
@@ -99,7 +100,7 @@ def find_quality(
             on_measured(rate, found[rate])
         low, high = (rate, high) if found[rate] > wanted else (low, rate)
     best = min(found, key=lambda rate: abs(found[rate] - wanted))
-    return Quality(wanted, best, found[best], chance, script, episodes, _as_text(task))
+    return Quality(wanted, best, found[best], chance, script, episodes, task)
 
 
 def kept_quality(
@@ -117,11 +118,10 @@ def kept_quality(
             kept = from_plain(json.loads(path.read_text()), Quality, QUALITY_FILE)
         except (ValueError, MessageError) as error:
             raise StorageError(f"{path}: expected a quality; got {error}; move it away") from error
-        asked, got = (wanted, episodes, _as_text(task)), (kept.wanted, kept.episodes, kept.task)
-        if asked != got:
+        if (kept.wanted, kept.episodes, kept.task) != (wanted, episodes, task):
             raise StorageError(
                 f"{path}: expected quality {wanted:g} over {episodes} episodes of this task; got "
-                f"{kept.wanted:g} over {kept.episodes} of {kept.task['environment']}; collect into "
+                f"{kept.wanted:g} over {kept.episodes} of {kept.task.environment}; collect into "
                 "another folder"
             )
         return kept
@@ -134,16 +134,6 @@ def kept_quality(
     return found
 
 
-def _as_text(task: TaskPreset) -> dict[str, str]:
-    return {name: json.dumps(value) for name, value in _plain(task).items()}
-
-
-def _plain(task: TaskPreset) -> dict[str, object]:
-    plain = to_plain(task)
-    assert isinstance(plain, dict)  # as of every dataclass
-    return plain
-
-
 def _mean_score(task: TaskPreset, episodes: int, jobs: int, mistake_rate: float) -> float:
     numbers = range(FIRST_SEED, FIRST_SEED + episodes)
     chunks = [list(numbers[first::jobs]) for first in range(min(jobs, episodes))]
@@ -153,13 +143,12 @@ def _mean_score(task: TaskPreset, episodes: int, jobs: int, mistake_rate: float)
 
 
 def _scores(task: TaskPreset, mistake_rate: float, numbers: list[int]) -> list[float]:
-    try:
-        env = make_env(task.environment, horizon=task.horizon, **task.options)
-        with closing(env):
+    with closing(make_task_env(task)) as env:
+        try:
             policy = scripted_demonstrator(env, task.n_actions, mistake_rate)
-            played = [play_episode(env, policy, number) for number in numbers]
-            if isinstance(env.unwrapped, FoldLinesEnv):
-                return [float(it.success_at_end) for it in played]
-            return [it.return_ for it in played]
-    except ValueError as error:
-        raise PresetError(f"{task.environment}: {error}") from error
+        except ValueError as error:
+            raise PresetError(f"{task.environment}: {error}") from error
+        played = [play_episode(env, policy, number) for number in numbers]
+        if isinstance(env.unwrapped, FoldLinesEnv):
+            return [float(it.success_at_end) for it in played]
+        return [it.return_ for it in played]

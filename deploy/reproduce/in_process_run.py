@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,7 @@ class InProcessRun(Closing):
     def _begin(self) -> CurvePoint:
         """Iteration 0: the untrained, the initialised or the cloned policy."""
         began_secs = time.perf_counter()
-        demonstrations = demonstrations_of(self._plan, self._work)
+        demonstrations = self._demonstrations
         report: UpdateReport | None = None
         loss, gradient_steps = None, 0
         if self._plan.key.start == "initialised":
@@ -187,11 +188,15 @@ class InProcessRun(Closing):
             secs=time.perf_counter() - began_secs,
         )
 
+    @cached_property
+    def _demonstrations(self) -> list[Trajectory]:
+        return demonstrations_of(self._plan, self._work)
+
     def _new_discriminators(self) -> Discriminators | None:
         imitation = self._preset.imitation
         if imitation is None or self._plan.key.start == "cloned":
             return None
-        real = real_states(demonstrations_of(self._plan, self._work), imitation.target_reward)
+        real = real_states(self._demonstrations, imitation.target_reward)
         return Discriminators(self._preset, real)
 
     def _cloning_epochs(self) -> int:
