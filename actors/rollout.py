@@ -5,13 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.envs import ClothbusEnv
-from broker_config.messages import Ticket, Trajectory, TrajectoryId
+from broker_config.messages import Mark, Ticket, Trajectory, TrajectoryId
+
+if TYPE_CHECKING:
+    from actors.robot.motion import JointPath  # brings numba, which only robots need
 
 Observation = NDArray[np.uint8]
 """u8[H, W, C]."""
@@ -42,6 +45,10 @@ class Step:
     truncated: bool
     success: bool
     guard: str | None
+    marks: tuple[Mark, ...] = ()
+    """Where the action picked, dropped and folded, in pixels of the picture."""
+    motion: JointPath | None = None
+    """How the robot moved for it, if one did."""
 
 
 def rollout(
@@ -55,10 +62,10 @@ def rollout(
     Environment and policy are seeded from the ticket alone, so that an episode of a deterministic
     environment is the same whoever plays it. The caller may stop between any two steps.
     """
-    env_seed, policy_seed = np.random.SeedSequence(ticket.seed).spawn(2)
+    _, policy_seed = np.random.SeedSequence(ticket.seed).spawn(2)
     generator = np.random.default_rng(policy_seed)
     options = None if reset_options is None else dict(reset_options)
-    observation, _ = env.reset(seed=int(env_seed.generate_state(1)[0]), options=options)
+    observation, _ = env.reset(seed=environment_seed(ticket), options=options)
     yield Start(observation)
     for _ in range(ticket.steps):
         action = policy.act(observation, generator, ticket.epsilon)
@@ -66,6 +73,12 @@ def rollout(
         yield _step(action, float(reward), observation, terminated, truncated, info)
         if terminated or truncated:
             return
+
+
+def environment_seed(ticket: Ticket) -> int:
+    """With which `reset` begins the ticket's episode."""
+    env_seed, _ = np.random.SeedSequence(ticket.seed).spawn(2)
+    return int(env_seed.generate_state(1)[0])
 
 
 def _step(
@@ -85,6 +98,8 @@ def _step(
         bool(truncated),
         bool(info.get("success", False)),
         None if guard is None else str(guard),
+        info.get("marks", ()),
+        info.get("motion"),
     )
 
 

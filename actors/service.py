@@ -23,10 +23,10 @@ from actors.rollout import (
 from actors.task import make_task_env
 from actors.views import Views
 from broker_config.bus import Bus
-from broker_config.errors import OwnerUnreachable, Refused, SpoolFull
+from broker_config.errors import Refused, SpoolFull
 from broker_config.failpoints import Failpoint, reach
 from broker_config.heart import Heart, Pulse
-from broker_config.joining import attach
+from broker_config.joining import StopRequested, attach, insist
 from broker_config.messages import (
     Instruction,
     Snapshot,
@@ -50,10 +50,6 @@ RETRY_SECS = 0.5
 
 FLUSH_AT_STOP_SECS = 5.0
 FLUSH_AT_END_SECS = 60.0
-
-
-class StopRequested(Exception):
-    """The process was asked to leave in the middle of something."""
 
 
 class Actor:
@@ -215,16 +211,10 @@ class Actor:
         )
 
     def _insist(self, ask: Callable[[], R]) -> R:
-        """Asks until the owner answers: a simulator can wait for as long as it takes."""
-        while not self._stop.is_set():
-            self._pulse.beat()
-            try:
-                return ask()
-            except OwnerUnreachable as error:
-                self.state = "waiting for the owner"
-                _log.debug("%s", error)
-                self._stop.wait(RETRY_SECS)
-        raise StopRequested
+        return insist(ask, self._stop, self._pulse.beat, self._note_silence)
+
+    def _note_silence(self) -> None:
+        self.state = "waiting for the owner"
 
     # Acting -----------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ import logging
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Protocol, TypeVar
 
 import zenoh
@@ -393,6 +393,28 @@ def open_bus(
     try:
         with Bus(session, run, role, process_id, rejected) as bus:
             yield bus
+    finally:
+        _close(session)
+
+
+@contextmanager
+def open_places(
+    address: str | None, run: str, overrides: Sequence[str] = ()
+) -> Iterator[Callable[[Role, str], Bus]]:
+    """Attaches to a router once, for one process that speaks as several.
+
+    Yields:
+        Gives a place on the bus, as a role and under a name; what is still open is closed at the
+        end.
+
+    Raises:
+        RouterUnreachable: Nobody answers at the address.
+        ConfigurationError: An override cannot be used.
+    """
+    session = open_session("client", address, overrides)
+    try:
+        with ExitStack() as stack:
+            yield lambda role, name: stack.enter_context(Bus(session, run, role, name))
     finally:
         _close(session)
 

@@ -103,6 +103,26 @@ CONTRACT: tuple[Row, ...] = (
         why="followers pull at their own pace, so that a slow one delays nobody and loses nothing",
     ),
     Row(
+        kind=Kind.REWARDS,
+        messages=(messages.Rewards,),
+        replies=(messages.RewardsAck,),
+        publisher="discriminator",
+        consumer="owner",
+        delivery=Delivery.QUERY,
+        quality=Quality("block", "data", is_express=False),
+        why="acked once they are committed: nothing is learned from rewards that are not kept",
+    ),
+    Row(
+        kind=Kind.DISCRIMINATORS,
+        messages=(messages.DiscriminatorSnapshot,),
+        replies=(),
+        publisher="discriminator",
+        consumer="observers",
+        delivery=Delivery.LATEST,
+        quality=Quality("drop", "data_low", is_express=False),
+        why="what is rewarded can be looked at while it changes; the journal has every version",
+    ),
+    Row(
         kind=Kind.POLICY,
         messages=(messages.Snapshot,),
         replies=(),
@@ -193,6 +213,8 @@ def _sender_of(message: object) -> tuple[str | None, str | None]:
             return "actor", message.id.actor
         case messages.TicketRequest() | messages.View():
             return "actor", message.actor
+        case messages.Rewards():
+            return "discriminator", message.discriminator
         case (
             messages.Attach()
             | messages.Heartbeat()

@@ -36,8 +36,11 @@ class Failpoint(StrEnum):
     TRAJECTORY_RECEIVED = "trajectory-received"
     TRAJECTORY_JOURNALED = "trajectory-journaled"
     TICKET_JOURNALED = "ticket-journaled"
+    REWARDS_RECEIVED = "rewards-received"
+    REWARDS_JOURNALED = "rewards-journaled"
     # The learner, of itself
     EPISODE_ABSORBED = "episode-absorbed"
+    ITERATION_ANNOUNCED = "iteration-announced"
     POLICY_UPDATED = "policy-updated"
     FILE_WRITTEN = "file-written"
     CHECKPOINT_SAVED = "checkpoint-saved"
@@ -45,6 +48,11 @@ class Failpoint(StrEnum):
     ITERATION_JOURNALED = "iteration-journaled"
     SNAPSHOT_JOURNALED = "snapshot-journaled"
     SNAPSHOT_PUBLISHED = "snapshot-published"
+    # The discriminator service
+    ANNOUNCEMENT_FOLLOWED = "announcement-followed"
+    REWARDS_MADE = "rewards-made"
+    REWARDS_ACKED = "rewards-acked"
+    DISCRIMINATORS_PUBLISHED = "discriminators-published"
     # The recorder
     BATCH_RECEIVED = "batch-received"
     BATCH_WRITTEN = "batch-written"

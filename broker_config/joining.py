@@ -1,22 +1,66 @@
-"""Joining a run: what any process asks before it says anything else, and when the owner says no."""
+"""Joining a run: what any process asks before it says anything else, and when the owner says no.
+
+And how it asks whatever it has to ask: until the owner answers.
+"""
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
 from broker_config.bus import Bus
 from broker_config.codec import SCHEMA_VERSION
-from broker_config.errors import AttachRefused, Refused
+from broker_config.errors import AttachRefused, OwnerUnreachable, Refused
 from broker_config.messages import Attach, Refusal, Role, Welcome
 from broker_config.preset import Preset
 from broker_config.version import VERSION
+
+_log = logging.getLogger(__name__)
+
+R = TypeVar("R")
 
 ATTACH_TIMEOUT_SECS = 3.0
 RETRY_SECS = 0.5
 
 PATIENCE_SECS = 3.0
 """A refusal is asked again for so long: a killed process of the same name may still seem alive."""
+
+
+class StopRequested(Exception):
+    """The process was asked to leave in the middle of something."""
+
+
+def insist(
+    ask: Callable[[], R],
+    stop: threading.Event,
+    on_try: Callable[[], None],
+    on_silence: Callable[[], None],
+) -> R:
+    """Asks until the owner answers: whoever has nothing to lose can wait for as long as it takes.
+
+    Args:
+        ask: Asks once; safe to repeat.
+        stop: Set when the process is to leave.
+        on_try: Called before each question: waiting is no standstill.
+        on_silence: Called after each question that nobody has answered.
+
+    Raises:
+        StopRequested: `stop` is set.
+    """
+    has_said = False
+    while not stop.is_set():
+        on_try()
+        try:
+            return ask()
+        except OwnerUnreachable as error:
+            on_silence()
+            _log.log(logging.DEBUG if has_said else logging.INFO, "Waiting: %s", error)
+            has_said = True
+            stop.wait(RETRY_SECS)
+    raise StopRequested
 
 
 def attach(

@@ -115,20 +115,20 @@ class JournalReader(Closing):
             row = self._reader().execute(f"{_SELECT} WHERE name = ?", [name]).fetchone()
         return None if row is None else JournalEntry(*row)
 
-    def entries(self, prefix: str = "", without_prefix: str | None = None) -> list[JournalEntry]:
+    def entries(self, prefix: str = "", without: Sequence[str] = ()) -> list[JournalEntry]:
         """The entries whose names begin with a prefix, in order, all in memory.
 
         Args:
             prefix: What names must begin with.
-            without_prefix: What they must not begin with; entries passed over are not read.
+            without: What they must not begin with; entries passed over are not read.
 
         Raises:
             StorageError: The file cannot be read, or the journal is closed.
         """
         rule, values = "substr(name, 1, ?) = ?", [len(prefix), prefix]
-        if without_prefix is not None:
+        for other in without:
             rule += " AND substr(name, 1, ?) <> ?"
-            values += [len(without_prefix), without_prefix]
+            values += [len(other), other]
         with storage_errors(_SCHEMA.subject, self._path):
             rows = self._reader().execute(f"{_SELECT} WHERE {rule} ORDER BY offset", values)
             return [JournalEntry(*row) for row in rows]

@@ -21,6 +21,8 @@ class Kind(StrEnum):
     TICKET = "<run>/ticket/<actor>"
     TRAJECTORY = "<run>/trajectory/<actor>"
     JOURNAL = "<run>/journal/<role>/<id>"
+    REWARDS = "<run>/rewards/<discriminator>"
+    DISCRIMINATORS = "<run>/discriminators"
     POLICY = "<run>/policy"
     POLICY_VERSION = "<run>/policy/<version>"
     METRICS = "<run>/metrics/<role>/<id>"
@@ -45,7 +47,8 @@ class ParsedKey:
     run: str
     kind: Kind
     role: Role | None = None
-    """Of the process that the key belongs to; `actor` wherever the template has no role."""
+    """Of the process that the key belongs to; where the template has none, the template says it:
+    `<actor>`, `<discriminator>`."""
     id: str | None = None
     """Of the process that the key belongs to."""
     version: int | None = None
@@ -58,6 +61,7 @@ class ParsedKey:
             "<role>": self.role,
             "<id>": self.id,
             "<actor>": self.id,
+            "<discriminator>": self.id,
             "<version>": self.version,
         }
         return "/".join(str(values.get(segment, segment)) for segment in self.kind.split("/"))
@@ -91,6 +95,15 @@ class RunKeys:
     def journal(self, role: Role, process_id: str) -> str:
         """Where a follower pulls the journal."""
         return self._of_process(Kind.JOURNAL, role, process_id)
+
+    def rewards(self, discriminator: str) -> str:
+        """Where a discriminator service delivers an iteration's rewards."""
+        return self._of_process(Kind.REWARDS, "discriminator", discriminator)
+
+    @property
+    def discriminators(self) -> str:
+        """Where the newest discriminators are published."""
+        return str(ParsedKey(self.run, Kind.DISCRIMINATORS))
 
     @property
     def policy(self) -> str:
@@ -148,7 +161,8 @@ def parse_key(key: str) -> ParsedKey:
     if kind.count("/") == 3:
         return ParsedKey(run, kind, _require_role(segments[2]), require_id("key's id", segments[3]))
     if kind.count("/") == 2:
-        return ParsedKey(run, kind, "actor", require_id("key's actor", segments[2]))
+        role = _require_role(kind.rpartition("/")[2].strip("<>"))
+        return ParsedKey(run, kind, role, require_id(f"key's {role}", segments[2]))
     return ParsedKey(run, kind)
 
 

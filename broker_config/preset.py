@@ -17,7 +17,7 @@ from typing import Literal
 
 from broker_config.errors import MessageError, PresetError
 from broker_config.specs import Head, NetworkSpec
-from broker_config.structure import from_plain, to_plain
+from broker_config.structure import added, from_plain, to_plain
 
 TaskOption = bool | int | float | str
 
@@ -48,7 +48,10 @@ class TaskPreset:
 class AlgorithmPreset:
     """Which value-based update, and its temperatures."""
 
-    method: Literal["dpn", "edpn", "munchausen-dqn", "dqn", "double-dqn"]
+    method: Literal["dpn", "edpn", "munchausen-dqn", "dqn", "double-dqn", "sqil"]
+    """`sqil` (Reddy, Dragan and Levine, 2019) is soft Q-learning that imitates: what was
+    demonstrated is rewarded with 1, what the policy itself did with 0, and each minibatch has as
+    much of both. It has no use for discriminators, whatever the preset says of them."""
     head: Head
     eta: float
     """Inverse temperature of the smooth policy update (eq. 2.5)."""
@@ -73,7 +76,7 @@ class AlgorithmPreset:
     @property
     def is_epsilon_greedy(self) -> bool:
         """Whether it acts by its preferred action and chance, not by the softmax policy."""
-        return self.method not in ("dpn", "edpn")
+        return self.method not in ("dpn", "edpn", "sqil")
 
     @property
     def has_soft_value(self) -> bool:
@@ -87,8 +90,8 @@ class AlgorithmPreset:
 
     @property
     def alpha(self) -> float:
-        """1 / (1 + sigma * eta), eq. 4.10."""
-        return 1.0 / (1.0 + self.sigma * self.eta)
+        """1 / (1 + sigma * eta), eq. 4.10; 0 for SQIL, which does not hold on to its policy."""
+        return 0.0 if self.method == "sqil" else 1.0 / (1.0 + self.sigma * self.eta)
 
 
 @dataclass(frozen=True)
@@ -245,14 +248,16 @@ class DiscriminatorPreset:
     gradient_penalty: float
     """Weight of the squared gradient by real pictures; 0 for none."""
     target_prior: float
-    """Portion of target states among the generated ones, for the non-negative loss of positive and
-    unlabelled data; 0 for the loss of eq. 4.13."""
+    """Portion of target states among the generated ones, for D_T's non-negative loss of positive
+    and unlabelled data; 0 for the loss of eq. 4.13."""
     reward_bound: float
     """A discriminator's reward is at most this."""
     normalise_each: bool
     """Whether each discriminator's rewards are brought to the same spread before they are added."""
     centre_rewards: bool
     """Whether their mean over D_G is subtracted."""
+    random_turn_deg: float = added(0.0)
+    """Pictures, real and generated alike, are turned by up to so much; 0 for not at all."""
 
     def __post_init__(self) -> None:
         for name in ("learning_rate", "reward_bound"):
@@ -266,6 +271,8 @@ class DiscriminatorPreset:
             value = getattr(self, name)
             ok = math.isfinite(value) and value >= least
             _require(ok, f"imitation.discriminator.{name}", f"at least {least}", value)
+        turn = self.random_turn_deg
+        _require(0 <= turn <= 180, "imitation.discriminator.random_turn_deg", "0 to 180", turn)
         accuracy = self.most_accuracy
         rule = "a portion above 0.5, at most 1"
         _require(0.5 < accuracy <= 1, "imitation.discriminator.most_accuracy", rule, accuracy)
@@ -273,7 +280,7 @@ class DiscriminatorPreset:
 
 @dataclass(frozen=True)
 class ImitationPreset:
-    """Algorithm 4: rewards come from discriminators."""
+    """What is imitated; by Algorithm 4 rewards come from discriminators."""
 
     discriminators: Literal["expert", "target", "both"]
     demonstration_samples: int
@@ -315,12 +322,27 @@ class Preset:
         if self.algorithm.is_epsilon_greedy:
             rule = f"a table for {self.algorithm.method}"
             _require(self.exploration is not None, "exploration", rule, None)
+        if self.algorithm.method == "sqil":
+            has_table, rule = self.imitation is not None, "a table that says what sqil imitates"
+            _require(has_table, "imitation", rule, None)
+            size = self.schedule.minibatch_size
+            rule = "an even number for sqil: half are demonstrated"
+            _require(size % 2 == 0, "schedule.minibatch_size", rule, size)
         if self.imitation is not None:
             made = self.schedule.target_switches * self.schedule.epochs
             rule = f"schedule.target_switches * schedule.epochs, {made}"
             epochs = self.imitation.generator_epochs
             _require(epochs == made, "imitation.generator_epochs", rule, epochs)
+            when = self.schedule.update_every
+            _require(when == "iteration", "schedule.update_every", "iteration, to imitate", when)
+            rule = "none beside [imitation], whose memory is all of the policy's own"
+            _require(self.initialisation is None, "initialisation", rule, self.initialisation)
         _ = self.network  # refuses shapes and sizes that no network can have
+
+    @property
+    def has_discriminators(self) -> bool:
+        """Whether rewards come from discriminators."""
+        return self.imitation is not None and self.algorithm.method != "sqil"
 
     @property
     def network(self) -> NetworkSpec:
@@ -353,6 +375,25 @@ def preset_from_json(text: str) -> Preset:
         return from_plain(json.loads(text), Preset, "preset")
     except ValueError as error:
         raise PresetError(f"preset: {error}") from error
+
+
+def with_settings(preset: Preset, overrides: Iterable[str]) -> Preset:
+    """The preset with other settings.
+
+    Args:
+        preset: Whose others stay.
+        overrides: As for `preset_from_toml`.
+
+    Raises:
+        PresetError: A setting is unknown, or a value out of range.
+    """
+    table = json.loads(preset.to_json())
+    try:
+        for override in overrides:
+            _apply(table, override)
+        return from_plain(table, Preset, "preset")
+    except MessageError as error:
+        raise PresetError(str(error)) from error
 
 
 def preset_from_toml(text: str, overrides: Iterable[str] = ()) -> Preset:

@@ -7,10 +7,9 @@ is all that the next recorder needs.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
-
-from mcap.records import Channel, Message, Schema
 
 from broker_config.closing import Closing
 from broker_config.codec import decode_any, encode
@@ -29,7 +28,6 @@ from broker_config.messages import (
 from broker_config.ownership import FileLock
 from broker_config.recording_format import (
     GAP_TOPIC,
-    IMAGE_SUFFIX,
     MESSAGE_ENCODING,
     PRESENCE_TOPIC,
     RECORDER_TOPIC,
@@ -44,17 +42,20 @@ from broker_config.recording_format import (
     segment_paths,
     view_topic,
 )
-from broker_config.recording_reader import (
-    TornSegment,
-    damaged,
-    iter_recording,
-    read_facts,
-    scan_torn,
+from broker_config.recording_reader import iter_recording, read_excerpt, read_facts
+from broker_config.recording_records import DamagedSegment, TornSegment
+from broker_config.recording_scan import (
+    Damage,
+    DamageKind,
+    ScannedMessage,
+    WholeChunk,
+    scan_segment,
 )
 from broker_config.recording_segment import SegmentWriter, to_ns
+from broker_config.recording_viewers import shown_of_metrics, shown_of_view
 from broker_config.version import VERSION
 
-__all__ = ["RecordedMessage", "Recording", "iter_recording", "lock_recording"]
+__all__ = ["RecordedMessage", "Recording", "iter_recording", "lock_recording", "mend_recording"]
 
 SEGMENT_BYTES = 1 << 30
 LOCK_FILE = "recorder.lock"
@@ -107,7 +108,7 @@ class Recording(Closing):
         self._run = run
         self._incarnation = incarnation
         self._segment_bytes = segment_bytes
-        self._facts, number = _recover(folder, run, on_progress)
+        self._facts, number = mend_recording(folder, run, on_progress)
         self.held_offset = self._facts.next_offset
         self.gaps = 0
         self.written_bytes = 0
@@ -167,17 +168,33 @@ class Recording(Closing):
         """
         match message:
             case View():
-                topic = view_topic(message.actor)
-                self._note_gap(topic, message)
-                publish_time_ns = to_ns(message.unix_secs)
-                self._add(topic, message, message.sequence, publish_time_ns)
-                self._segment.add_image(topic + IMAGE_SUFFIX, message)
+                self.add_view(message)
             case Metrics():
                 topic = metrics_topic(message.role, message.id)
                 self._note_gap(topic, message)
                 self._add(topic, message, message.sequence)
+                for shown in shown_of_metrics(message):
+                    self._segment.add_shown(shown, message.sequence)
             case Presence():
                 self._add(PRESENCE_TOPIC, message)
+
+    def add_view(self, view: View, log_time_ns: int | None = None) -> None:
+        """Adds a view and what viewers see of it, and before them a gap if there is one.
+
+        Args:
+            view: What an actor saw.
+            log_time_ns: When that was, where it was kept back since; the time of this call if None.
+                Viewers play by it, and what belongs to a picture has the picture's.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        topic, unix_ns = view_topic(view.actor), to_ns(view.unix_secs)
+        self._note_gap(topic, view)
+        log_ns = time.time_ns() if log_time_ns is None else log_time_ns
+        self._add(topic, view, view.sequence, unix_ns, log_ns)
+        for shown in shown_of_view(view, unix_ns):
+            self._segment.add_shown(shown, view.sequence, unix_ns, log_ns)
 
     def flush(self) -> None:
         """Makes everything so far durable, and begins another segment if this one is full.
@@ -227,23 +244,45 @@ class Recording(Closing):
         self.gaps += 1
 
     def _add(
-        self, topic: str, message: object, sequence: int = 0, publish_time_ns: int | None = None
+        self,
+        topic: str,
+        message: object,
+        sequence: int = 0,
+        publish_time_ns: int | None = None,
+        log_time_ns: int | None = None,
     ) -> None:
         payload = encode(message)
         name = type(message).__name__
-        self._segment.add(topic, name, payload, sequence, publish_time_ns)
+        self._segment.add(topic, name, payload, sequence, publish_time_ns, log_time_ns)
         self._facts.note(message)
         self._segment_facts.note(message)
         self.written_bytes += len(payload)
         self._unflushed_bytes += len(payload)
 
 
-def _recover(folder: Path, run: str, on_progress: Callable[[], None]) -> tuple[Facts, int]:
-    """What is recorded, and the number of the segment with which to go on."""
+def mend_recording(
+    folder: Path, run: str, on_progress: Callable[[], None] = lambda: None
+) -> tuple[Facts, int]:
+    """Makes whole what the last recorder left, so that all of it can be read.
+
+    Whoever mends has locked the folder. Segments that are whole stay as they are.
+
+    Args:
+        folder: Of the recording.
+        run: Whose it is.
+        on_progress: Called now and then while a large segment is mended.
+
+    Returns:
+        What is recorded, and the number of the segment with which to go on.
+
+    Raises:
+        StorageError: A segment is damaged, of another run, or no clothbus recording.
+        OSError: The disk refuses.
+    """
     facts = Facts()
     paths = segment_paths(folder)
     for path in paths[:-1]:
-        facts.go_on_with(read_facts(path), str(path))
+        facts.go_on_with(_read_own_facts(path), str(path))
     number = segment_number(paths[-1]) + 1 if paths else 0
     if paths:
         last = _recover_newest(paths[-1], on_progress)
@@ -256,14 +295,25 @@ def _recover(folder: Path, run: str, on_progress: Callable[[], None]) -> tuple[F
             f"recording {folder}: expected one of run {run}; got one of {facts.run}; "
             "record into another folder"
         )
+    segment_path(folder, number).unlink(missing_ok=True)
     return facts, number
 
 
 def _recover_newest(path: Path, on_progress: Callable[[], None]) -> Facts | None:
     try:
-        return read_facts(path)
+        return _read_own_facts(path)
     except TornSegment:
         return _mend(path, on_progress)
+
+
+def _read_own_facts(path: Path) -> Facts:
+    """The facts of a segment that a recorder wrote: only behind its last entry all are there."""
+    if (excerpt := read_excerpt(path)) is not None:
+        raise StorageError(
+            f"recording {path}: expected a segment that a recorder wrote; got a {excerpt.kind} of "
+            f"{excerpt.source}; record into another folder"
+        )
+    return read_facts(path)
 
 
 def _mend(path: Path, on_progress: Callable[[], None]) -> Facts | None:
@@ -297,26 +347,30 @@ def _copy_whole(
     path: Path, segment: SegmentWriter, on_progress: Callable[[], None]
 ) -> Facts | None:
     facts = Facts()
-    channels: dict[int, Channel] = {}
     is_empty = True
-    for record in scan_torn(path):
+    for item in scan_segment(path):
         on_progress()
-        match record:
-            case Channel():
-                channels[record.id] = record
-            case Message():
-                is_empty = False
-                if channels[record.channel_id].message_encoding == MESSAGE_ENCODING:
-                    facts.note(_decoded(path, record))
-            case Schema():
-                pass
-        segment.copy(record)
+        match item:
+            case Damage(DamageKind.LOST):
+                raise DamagedSegment(path, item.what)
+            case WholeChunk():
+                for found in item.messages:
+                    is_empty = False
+                    _copy(path, found, segment, facts)
     return None if is_empty else facts
 
 
-def _decoded(path: Path, message: Message) -> object:
+def _copy(path: Path, found: ScannedMessage, segment: SegmentWriter, facts: Facts) -> None:
+    if found.channel is None:
+        raise DamagedSegment(path, f"a message of channel {found.message.channel_id}, unheard of")
+    if found.channel.message_encoding == MESSAGE_ENCODING:
+        facts.note(_decoded(path, found.message.data))
+    segment.copy(found.schema, found.channel, found.message)
+
+
+def _decoded(path: Path, payload: bytes) -> object:
     try:
-        return decode_any(message.data)
+        return decode_any(payload)
     except SchemaMismatch as error:
         raise StorageError(
             f"recording {path}: expected a segment of this clothbus version; got another's, which "
@@ -324,4 +378,4 @@ def _decoded(path: Path, message: Message) -> object:
             "another folder"
         ) from error
     except ClothbusError as error:
-        raise damaged(path, f"a message that cannot be read ({error})") from error
+        raise DamagedSegment(path, f"a message that cannot be read ({error})") from error

@@ -7,17 +7,21 @@ jump backwards.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from broker_config.codec import decode_any
 from broker_config.errors import StorageError
 from broker_config.messages import (
     JournalEntry,
     Metrics,
+    Presence,
     RecorderStarted,
     RecordingGap,
     Snapshot,
@@ -28,35 +32,87 @@ PROFILE = "clothbus"
 """MCAP's profile in the header of every segment."""
 
 MESSAGE_ENCODING = "msgpack"
-"""Of messages that are the codec's; pictures for viewers are protobuf."""
+"""Of messages that are the codec's; what is for viewers is protobuf or ROS 2's `cdr`."""
 
 IMAGE_SUFFIX = "/image"
+ANNOTATIONS_SUFFIX = "/annotations"
+REWARD_SUFFIX = "/reward"
 SNAPSHOT_TOPIC = "snapshot"
 PRESENCE_TOPIC = "presence"
 GAP_TOPIC = "gap"
 RECORDER_TOPIC = "recorder"
+POLICY_GAP_PREFIX = "policy/"
+
+JOURNAL_PREFIX = "journal/"
+"""Of the topics of journal entries, one for each sort."""
+
+VIEW_PREFIX = "view/"
+METRICS_PREFIX = "metrics/"
 
 _SEGMENT_NAME = re.compile(r"(\d{6,})\.mcap")
 
 
 def journal_topic(entry_name: str) -> str:
     """Under which topic a journal entry lies: entries of one sort share one."""
-    return f"journal/{entry_name.partition('/')[0]}"
+    return f"{JOURNAL_PREFIX}{entry_name.partition('/')[0]}"
 
 
 def metrics_topic(role: str, process_id: str) -> str:
-    """Under which topic a process's numbers lie."""
-    return f"metrics/{role}/{process_id}"
+    """Under which topic a process's numbers lie; with `/<name>`, each of them for viewers."""
+    return f"{METRICS_PREFIX}{role}/{process_id}"
 
 
 def view_topic(actor: str) -> str:
-    """Under which topic an actor's views lie; with `IMAGE_SUFFIX`, its pictures for viewers."""
-    return f"view/{actor}"
+    """Under which topic an actor's views lie; with a suffix, what viewers make of them."""
+    return f"{VIEW_PREFIX}{actor}"
+
+
+def topic_of(message: object) -> str | None:
+    """Under which topic a message of the contract lies; None if recordings have no such message."""
+    match message:
+        case JournalEntry():
+            return journal_topic(message.name)
+        case Snapshot():
+            return SNAPSHOT_TOPIC
+        case View():
+            return view_topic(message.actor)
+        case Metrics():
+            return metrics_topic(message.role, message.id)
+        case Presence():
+            return PRESENCE_TOPIC
+        case RecordingGap():
+            return GAP_TOPIC
+        case RecorderStarted():
+            return RECORDER_TOPIC
+        case _:
+            return None
+
+
+def is_wanted(topic: str, topics: Collection[str] | None) -> bool:
+    """Whether a topic is among the chosen ones; all are if None."""
+    if topics is None or topic in topics:
+        return True
+    return any(it.endswith("/") and topic.startswith(it) for it in topics)
+
+
+def view_topic_of(topic: str) -> str | None:
+    """The topic of the views that a topic for viewers is made of; None if it is of something else.
+
+    `view/<actor>/image` and `robot/<actor>/joints` are of `view/<actor>`.
+    """
+    prefix, _, rest = topic.partition("/")
+    actor, separator, _ = rest.partition("/")
+    return view_topic(actor) if prefix in ("view", "robot") and separator else None
+
+
+def joints_topic(actor: str) -> str:
+    """Under which topic the joints of an actor's robot lie, for viewers."""
+    return f"robot/{actor}/joints"
 
 
 def policy_gap_key(version: int) -> str:
     """The key in the gap that notes a policy version whose weights were gone."""
-    return f"policy/{version}"
+    return f"{POLICY_GAP_PREFIX}{version}"
 
 
 def segment_path(folder: Path, number: int) -> Path:
@@ -70,6 +126,23 @@ def segment_paths(folder: Path) -> list[Path]:
     Raises:
         StorageError: One in the middle is missing, or the folder cannot be read.
     """
+    found = numbered_segments(folder)
+    for before, number in itertools.pairwise(found):
+        if number != before + 1:
+            raise StorageError(
+                f"recording {folder}: expected segment {segment_path(folder, before + 1).name} "
+                f"after {found[before].name}; got {found[number].name}; put the missing segments "
+                "back, or record into another folder"
+            )
+    return list(found.values())
+
+
+def numbered_segments(folder: Path) -> dict[int, Path]:
+    """The segments that there are, by number, oldest first.
+
+    Raises:
+        StorageError: The folder cannot be read.
+    """
     try:
         found = {int(name[1]): path for path in folder.iterdir() if (name := _segment(path))}
     except OSError as error:
@@ -77,15 +150,7 @@ def segment_paths(folder: Path) -> list[Path]:
             f"recording {folder}: expected a folder that can be read; got {error}; "
             "name the folder that a recorder wrote"
         ) from error
-    numbers = sorted(found)
-    for before, number in itertools.pairwise(numbers):
-        if number != before + 1:
-            raise StorageError(
-                f"recording {folder}: expected segment {segment_path(folder, before + 1).name} "
-                f"after {found[before].name}; got {found[number].name}; put the missing segments "
-                "back, or record into another folder"
-            )
-    return [found[number] for number in numbers]
+    return dict(sorted(found.items()))
 
 
 def segment_number(path: Path) -> int:
@@ -103,7 +168,7 @@ class RecordedMessage:
 
     topic: str
     encoding: str
-    """`msgpack`: the codec's; `protobuf`: a picture for viewers."""
+    """`msgpack`: the codec's; `protobuf` and `cdr`: for viewers."""
     sequence: int
     """Of a journal entry its offset, of metrics and views the sender's; modulo 2**32."""
     log_time_ns: int
@@ -116,7 +181,7 @@ class RecordedMessage:
         """The message of the contract.
 
         Raises:
-            DecodeError: It is a picture for viewers, or damaged.
+            DecodeError: It is for viewers, or damaged.
             SchemaMismatch: It was written by another schema version.
         """
         return decode_any(self.payload)
@@ -219,3 +284,73 @@ class Facts:
     def _note_sequence(self, topic: str, incarnation: str, end: int) -> None:
         key = f"{topic} {incarnation}"
         self.next_sequences[key] = max(end, self.next_sequences.get(key, 0))
+
+
+class EntryTally:
+    """Which journal entries were met, in constant memory."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._digest = hashlib.sha256()
+
+    def note(self, offset: int) -> None:
+        """Takes in the next entry."""
+        self.count += 1
+        self._digest.update(offset.to_bytes(8, "little"))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the offsets, each as eight bytes, in order."""
+        return self._digest.hexdigest()
+
+
+ExcerptKind = Literal["slice", "recovery"]
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Where the messages of a segment come from that no recorder wrote.
+
+    Entries of the journal may be missing from it, so that no recorder goes on with it.
+    """
+
+    kind: ExcerptKind
+    source: str
+    """Name of the file or folder."""
+    part: str
+    """Which part of it, for a person: episodes 3-7; without bytes 100 to 200."""
+    topics: tuple[str, ...] | None
+    """Of a slice: the chosen ones, all if None."""
+    entries: int
+    """Of the journal, in this segment."""
+    entries_digest: str
+    """Of their offsets, by `EntryTally`."""
+
+    def to_metadata(self) -> dict[str, str]:
+        """As MCAP metadata holds it."""
+        return {
+            "kind": self.kind,
+            "source": self.source,
+            "part": self.part,
+            "topics": json.dumps(self.topics),
+            "entries": str(self.entries),
+            "entries_digest": self.entries_digest,
+        }
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, str]) -> Excerpt:
+        """Reads it again.
+
+        Raises:
+            KeyError: A field is missing.
+            ValueError: A field is none of ours.
+        """
+        topics = json.loads(metadata["topics"])
+        return cls(
+            "slice" if metadata["kind"] == "slice" else "recovery",
+            metadata["source"],
+            metadata["part"],
+            None if topics is None else tuple(map(str, topics)),
+            int(metadata["entries"]),
+            metadata["entries_digest"],
+        )

@@ -1,15 +1,11 @@
-"""Reading recordings: finished segments by their index, torn ones as far as they are whole.
-
-Every chunk is checked against its checksum and every record against its own lengths, so that a
-damaged file is told from one that was cut off when its recorder died.
-"""
+"""Reading finished segments by their index."""
 
 from __future__ import annotations
 
 import os
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
@@ -18,39 +14,48 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import FOOTER_SIZE
-from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.records import (
+    Channel,
+    ChunkIndex,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import MAGIC_SIZE, StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
+from broker_config.codec import SCHEMA_VERSION
 from broker_config.errors import StorageError
-from broker_config.recording_format import PROFILE, Facts, RecordedMessage, segment_paths
-from broker_config.recording_segment import FACTS_METADATA
-
-_FRAME = struct.Struct("<BQ")
-"""Opcode and length, before every record."""
-_CHUNK_HEAD_BYTES = 32
-"""Of a chunk's content, up to and with the length of the compression's name."""
-_HEAD_BYTES = 64
-"""As much of a record's content as its own lengths lie in."""
-_LONGEST_NAME_BYTES = 8
-_DATA_END_BYTES = 4
-_MOST_RECORD_BYTES = 4 << 30
-_PROFILE_FIELD = struct.pack("<I", len(PROFILE)) + PROFILE.encode()
-
-
-class TornSegment(StorageError):
-    """A segment that ends in the middle, as its recorder left it when it died."""
-
-    def __init__(self, path: Path, size_bytes: int) -> None:
-        super().__init__(
-            f"recording {path}: expected a finished segment; got one that is cut off after "
-            f"{size_bytes} bytes; its recorder still writes it, or mends it at its next start"
-        )
+from broker_config.recording_format import (
+    Excerpt,
+    Facts,
+    RecordedMessage,
+    is_wanted,
+    segment_paths,
+)
+from broker_config.recording_records import (
+    FRAME,
+    PROFILE_FIELD,
+    DamagedSegment,
+    ForeignFile,
+    TornSegment,
+    open_chunk,
+    open_segment,
+)
+from broker_config.recording_segment import (
+    EXCERPT_METADATA,
+    FACTS_METADATA,
+    SCHEMA_VERSION_FIELD,
+)
 
 
 def iter_recording(
-    source: Path | Collection[Path], topics: Collection[str] | None = None
+    source: Path | Collection[Path],
+    topics: Collection[str] | None = None,
 ) -> Iterator[RecordedMessage]:
     """The messages of a recording in the order in which they were written, a chunk in memory.
 
@@ -62,6 +67,17 @@ def iter_recording(
         StorageError: A segment is cut off, empty, damaged, or no clothbus recording, or there is
             none.
     """
+    for path in segments_of(source):
+        for _, channel, message in iter_segment(path, topics):
+            yield recorded(channel, message)
+
+
+def segments_of(source: Path | Collection[Path]) -> list[Path]:
+    """The segments of a recording's folder, or what was given.
+
+    Raises:
+        StorageError: There is none, or one in the middle is missing.
+    """
     paths = segment_paths(source) if isinstance(source, Path) and source.is_dir() else source
     paths = [paths] if isinstance(paths, Path) else list(paths)
     if not paths:
@@ -69,130 +85,48 @@ def iter_recording(
             f"recording {source}: expected segments like 000000.mcap; got none; "
             "name the folder that a recorder wrote"
         )
-    for path in paths:
-        yield from _iter_segment(path, topics)
+    return paths
 
 
-def read_facts(path: Path) -> Facts:
-    """What a finished segment says of itself.
+def iter_segment(
+    path: Path,
+    topics: Collection[str] | None = None,
+    on_bytes: Callable[[int], None] = lambda _: None,
+) -> Iterator[tuple[Schema | None, Channel, Message]]:
+    """The messages of a finished segment with what tells of them, a chunk in memory.
 
-    Raises:
-        TornSegment: It is not finished.
-        StorageError: It is damaged, or no clothbus recording.
-    """
-    with _open(path) as file:
-        summary = _read_summary(file, path)
-        try:
-            (index,) = (it for it in summary.metadata_indexes if it.name == FACTS_METADATA)
-            file.seek(index.offset + _FRAME.size)
-            metadata = Metadata.read(ReadDataStream(file))
-            return Facts.from_metadata(metadata.metadata)
-        except (ValueError, KeyError, McapError, struct.error, OSError) as error:
-            raise damaged(path, f"no facts ({error})") from error
-
-
-def scan_torn(path: Path) -> Iterator[Schema | Channel | Message]:
-    """The whole records of a segment that is not finished, in order, a chunk in memory.
-
-    It ends where the file is cut off.
+    Args:
+        path: Of the segment.
+        topics: As `iter_recording` has them; chunks without them are passed over.
+        on_bytes: Told how many bytes of chunks have been read or passed since it was last told.
 
     Raises:
-        StorageError: The file is damaged before that, or no clothbus recording.
+        StorageError: It is cut off, empty, damaged, or no clothbus recording.
     """
-    with _open(path) as file:
-        size = os.fstat(file.fileno()).st_size
-        if not MCAP0_MAGIC.startswith(file.read(MAGIC_SIZE)):
-            raise _foreign(path)
-        is_first = True
-        while (frame := file.read(_FRAME.size)) and len(frame) == _FRAME.size:
-            opcode, length = _FRAME.unpack(frame)
-            start = file.tell()
-            _check_lengths(path, opcode, length, file.read(_HEAD_BYTES), is_first=is_first)
-            if opcode == Opcode.DATA_END or start + length > size:
-                return  # what comes after the data follows from them
-            file.seek(start)
-            if opcode == Opcode.CHUNK:
-                yield from _open_chunk(path, file)
-            file.seek(start + length)
-            is_first = False
-
-
-def _check_lengths(path: Path, opcode: int, length: int, head: bytes, *, is_first: bool) -> None:
-    """Tells a record that was cut off from one whose length is damaged.
-
-    Both seem to go on after the end of the file; but only in the first case do the lengths within
-    the record agree with its own.
-    """
-    if (opcode == Opcode.HEADER) != is_first:
-        raise damaged(path, f"a record of kind {opcode} in a wrong place")
-    match opcode:
-        case Opcode.HEADER:
-            if not _PROFILE_FIELD.startswith(head[: len(_PROFILE_FIELD)]):
-                raise _foreign(path)
-            is_sound = _agrees(head, len(_PROFILE_FIELD), len(_PROFILE_FIELD) + 4, length)
-        case Opcode.CHUNK:
-            is_sound = _is_sound_chunk(head, length)
-        case Opcode.MESSAGE_INDEX:
-            is_sound = _agrees(head, 2, 6, length)
-        case Opcode.METADATA:
-            is_sound = True  # facts, which follow from the messages
-        case Opcode.DATA_END:
-            is_sound = length == _DATA_END_BYTES
-        case _:
-            is_sound = False
-    if not is_sound:
-        raise damaged(path, f"a record of kind {opcode} with {length} bytes")
-
-
-def _agrees(head: bytes, at: int, rest: int, length: int) -> bool:
-    """Whether the u32 at an offset says how long the record is after `rest` bytes."""
-    if len(head) < at + 4:
-        return True  # cut off before it says so
-    (size,) = struct.unpack_from("<I", head, at)
-    return bool(length == rest + size)
-
-
-def _is_sound_chunk(head: bytes, length: int) -> bool:
-    if len(head) < _CHUNK_HEAD_BYTES:
-        return True
-    (name_bytes,) = struct.unpack_from("<I", head, _CHUNK_HEAD_BYTES - 4)
-    if name_bytes > _LONGEST_NAME_BYTES:
-        return False
-    data_at = _CHUNK_HEAD_BYTES + name_bytes + 8
-    if len(head) < data_at:
-        return True
-    (data_bytes,) = struct.unpack_from("<Q", head, data_at - 8)
-    return bool(length == data_at + data_bytes)
-
-
-def _open_chunk(path: Path, file: BinaryIO) -> Iterator[Schema | Channel | Message]:
-    """The records of the chunk whose content begins here."""
-    start = file.tell()
-    try:
-        chunk = Chunk.read(ReadDataStream(file))
-        records = breakup_chunk(chunk, validate_crc=True)
-    # The checks above the library's own leave it to fail on damaged bytes in any way.
-    except Exception as error:
-        raise damaged(path, f"a chunk at byte {start} that cannot be read ({error})") from error
-    for record in records:
-        if isinstance(record, Schema | Channel | Message):
-            yield record
-
-
-def _iter_segment(path: Path, topics: Collection[str] | None) -> Iterator[RecordedMessage]:
-    with _open(path) as file:
-        summary = _read_summary(file, path)
-        wanted = {id_: it for id_, it in summary.channels.items() if _is_wanted(it.topic, topics)}
+    with open_segment(path) as file:
+        summary = read_summary(file, path)
+        wanted = {id_: it for id_, it in summary.channels.items() if is_wanted(it.topic, topics)}
         for index in summary.chunk_indexes:
-            if wanted.keys().isdisjoint(index.message_index_offsets):
-                continue
-            file.seek(index.chunk_start_offset)
-            opcode, length = _FRAME.unpack(file.read(_FRAME.size).ljust(_FRAME.size, b"\0"))
-            if (opcode, length + _FRAME.size) != (Opcode.CHUNK, index.chunk_length):
-                raise damaged(path, f"no chunk at byte {index.chunk_start_offset}")
-            for record in _open_chunk(path, file):
-                if isinstance(record, Message) and record.channel_id in wanted:
-                    yield recorded(wanted[record.channel_id], record)
+            if not wanted.keys().isdisjoint(index.message_index_offsets):
+                for message in read_chunk(file, path, index):
+                    if (channel := wanted.get(message.channel_id)) is not None:
+                        yield summary.schemas.get(channel.schema_id), channel, message
+            on_bytes(index.chunk_length)
+
+
+def read_chunk(file: BinaryIO, path: Path, index: ChunkIndex) -> list[Message]:
+    """The messages of a chunk that the index names.
+
+    Raises:
+        DamagedSegment: It is not there, or not as it was written.
+    """
+    at_byte = index.chunk_start_offset
+    file.seek(at_byte)
+    opcode, length = FRAME.unpack(file.read(FRAME.size).ljust(FRAME.size, b"\0"))
+    if (opcode, length + FRAME.size) != (Opcode.CHUNK, index.chunk_length):
+        raise DamagedSegment(path, f"no chunk at byte {at_byte}")
+    records = open_chunk(path, at_byte, file.read(length))
+    return [record for record in records if isinstance(record, Message)]
 
 
 def recorded(channel: Channel, message: Message) -> RecordedMessage:
@@ -207,36 +141,108 @@ def recorded(channel: Channel, message: Message) -> RecordedMessage:
     )
 
 
-def _is_wanted(topic: str, topics: Collection[str] | None) -> bool:
-    if topics is None or topic in topics:
-        return True
-    return any(it.endswith("/") and topic.startswith(it) for it in topics)
+# What a segment says of itself -----------------------------------------------------------------
 
 
-def _read_summary(file: BinaryIO, path: Path) -> Summary:
+def read_facts(path: Path) -> Facts:
+    """What a finished segment says of itself.
+
+    Raises:
+        TornSegment: It is not finished.
+        StorageError: It is damaged, or no clothbus recording.
+    """
+    with open_segment(path) as file:
+        summary = read_summary(file, path)
+        try:
+            return Facts.from_metadata(read_metadata(file, summary)[FACTS_METADATA])
+        except (ValueError, KeyError, McapError, struct.error, OSError) as error:
+            raise DamagedSegment(path, f"no facts ({error})") from error
+
+
+def read_excerpt(path: Path) -> Excerpt | None:
+    """What a finished segment was copied from; None if a recorder wrote it.
+
+    Raises:
+        TornSegment: It is not finished.
+        StorageError: It is damaged, or no clothbus recording.
+    """
+    with open_segment(path) as file:
+        summary = read_summary(file, path)
+        try:
+            metadata = read_metadata(file, summary).get(EXCERPT_METADATA)
+            return None if metadata is None else Excerpt.from_metadata(metadata)
+        except (ValueError, KeyError, McapError, struct.error, OSError) as error:
+            raise DamagedSegment(path, f"no readable origin ({error})") from error
+
+
+def read_metadata(file: BinaryIO, summary: Summary) -> dict[str, dict[str, str]]:
+    """The MCAP metadata of a segment, by name."""
+    found = {}
+    for index in summary.metadata_indexes:
+        file.seek(index.offset + FRAME.size)
+        # The library asks for any stream; a file is one.
+        metadata = Metadata.read(ReadDataStream(file))
+        found[metadata.name] = metadata.metadata
+    return found
+
+
+def require_schema_version(path: Path, channels: Iterable[Channel]) -> None:
+    """Refuses what another schema version wrote.
+
+    Raises:
+        StorageError: A channel is of another version.
+    """
+    for version in schema_versions(channels):
+        if version != SCHEMA_VERSION:
+            raise StorageError(
+                f"recording {path}: expected schema version {SCHEMA_VERSION}, which this clothbus "
+                f"reads; got {version}; use the clothbus version that wrote it (`clothbus info` "
+                "names it)"
+            )
+
+
+def schema_versions(channels: Iterable[Channel]) -> list[int]:
+    """The codec's versions that channels are of; pictures for viewers have none."""
+    found = {it.metadata.get(SCHEMA_VERSION_FIELD) for it in channels}
+    return sorted(int(version) for version in found if version is not None)
+
+
+def read_summary(file: BinaryIO, path: Path) -> Summary:
     """The index at the end of a finished segment, checked against its checksum.
 
     Raises:
         TornSegment: There is none.
-        StorageError: It is damaged, or the file is no clothbus recording.
+        ForeignFile: No recorder wrote it.
+        DamagedSegment: It is damaged.
+    """
+    file.seek(0)
+    head = file.read(MAGIC_SIZE + FRAME.size + len(PROFILE_FIELD))
+    profile = head[MAGIC_SIZE + FRAME.size :]
+    if not MCAP0_MAGIC.startswith(head[:MAGIC_SIZE]) or not PROFILE_FIELD.startswith(profile):
+        raise ForeignFile(path)
+    return read_index(file, path)
+
+
+def read_index(file: BinaryIO, path: Path) -> Summary:
+    """The same of a file whose beginning is not looked at.
+
+    Raises:
+        TornSegment: There is none.
+        DamagedSegment: It is damaged.
     """
     size = os.fstat(file.fileno()).st_size
-    head = file.read(MAGIC_SIZE + _FRAME.size + len(_PROFILE_FIELD))
-    profile = head[MAGIC_SIZE + _FRAME.size :]
-    if not MCAP0_MAGIC.startswith(head[:MAGIC_SIZE]) or not _PROFILE_FIELD.startswith(profile):
-        raise _foreign(path)
     tail_bytes = FOOTER_SIZE + MAGIC_SIZE
     file.seek(max(0, size - tail_bytes))
     tail = file.read(tail_bytes)
     if size < tail_bytes or not tail.endswith(MCAP0_MAGIC):
         raise TornSegment(path, size)
-    start, _, checksum = struct.unpack_from("<QQI", tail, _FRAME.size)
+    start, _, checksum = struct.unpack_from("<QQI", tail, FRAME.size)
     if not MAGIC_SIZE <= start <= size - tail_bytes:
-        raise damaged(path, "no index at its end")
+        raise DamagedSegment(path, "no index at its end")
     file.seek(start)
     section = file.read()
     if zlib.crc32(section[: -MAGIC_SIZE - 4]) != checksum:
-        raise damaged(path, "a damaged index at its end")
+        raise DamagedSegment(path, "a damaged index at its end")
     summary = Summary()
     for record in StreamReader(BytesIO(section), skip_magic=True).records:
         _take_up(summary, record)
@@ -249,35 +255,9 @@ def _take_up(summary: Summary, record: McapRecord) -> None:
             summary.schemas[record.id] = record
         case Channel():
             summary.channels[record.id] = record
-        case Footer():
-            pass
-        case _ if (indexes := _INDEXES.get(type(record).__name__)) is not None:
-            getattr(summary, indexes).append(record)
-
-
-_INDEXES = {"ChunkIndex": "chunk_indexes", "MetadataIndex": "metadata_indexes"}
-
-
-def _open(path: Path) -> BinaryIO:
-    try:
-        return path.open("rb")
-    except OSError as error:
-        raise StorageError(
-            f"recording {path}: expected a segment that can be read; got {error}; "
-            "check the path and its permissions"
-        ) from error
-
-
-def _foreign(path: Path) -> StorageError:
-    return StorageError(
-        f"recording {path}: expected a segment of a clothbus recording; got another file; "
-        "move it away, or choose another folder"
-    )
-
-
-def damaged(path: Path, what: str) -> StorageError:
-    """The error for a segment that was changed after it was written; nothing touches it."""
-    return StorageError(
-        f"recording {path}: expected a sound segment; got {what}; the file was damaged: move it to "
-        "a safe place, and record into another folder (the run's journal still has everything)"
-    )
+        case Statistics():
+            summary.statistics = record
+        case ChunkIndex():
+            summary.chunk_indexes.append(record)
+        case MetadataIndex():
+            summary.metadata_indexes.append(record)

@@ -2,26 +2,40 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from pathlib import Path
 from typing import IO, Any, cast
 
-from foxglove.messages import CompressedImage, Timestamp
 from mcap.records import Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
 from broker_config.codec import SCHEMA_VERSION
 from broker_config.durable import sync_folder
-from broker_config.messages import View
-from broker_config.recording_format import MESSAGE_ENCODING, PROFILE, Facts
+from broker_config.recording_format import MESSAGE_ENCODING, PROFILE, Excerpt, Facts
+from broker_config.recording_viewers import Form, Shown
 from broker_config.version import VERSION
+
+_log = logging.getLogger(__name__)
 
 FACTS_METADATA = "clothbus.facts"
 """Name of the MCAP metadata that holds a segment's `Facts`."""
 
+EXCERPT_METADATA = "clothbus.excerpt"
+"""Name of the MCAP metadata of a segment that was copied: its `Excerpt`."""
+
+MESSAGE_FIELD = "message"
+SCHEMA_VERSION_FIELD = "schema_version"
+"""What the metadata of a channel of the codec's messages says of them."""
+
 CHUNK_BYTES = 1 << 20
-_SEQUENCE_MODULUS = 1 << 32
+
+MOST_CHANNELS = 1 << 14
+"""MCAP counts channels with 16 bits. Names of numbers are a sender's, and what viewers see of them
+must not stop a recorder: beyond this, new ones are left out."""
+
+SEQUENCE_MODULUS = 1 << 32
 _NS_PER_SEC = 1_000_000_000
 
 
@@ -79,8 +93,7 @@ class SegmentWriter:
         )
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._copied_schemas: dict[int, int] = {}
-        self._copied_channels: dict[int, int] = {}
+        self._has_left_out = False
         try:
             self._mcap.start(PROFILE, f"clothbus {VERSION}")
             sync_folder(path.parent)
@@ -100,6 +113,7 @@ class SegmentWriter:
         payload: bytes,
         sequence: int = 0,
         publish_time_ns: int | None = None,
+        log_time_ns: int | None = None,
     ) -> None:
         """Adds an encoded message.
 
@@ -109,55 +123,51 @@ class SegmentWriter:
             payload: What the codec made of it.
             sequence: A number that its origin gave it.
             publish_time_ns: When it came to be; the time of this call if None.
+            log_time_ns: When it was heard; the time of this call if None.
 
         Raises:
             OSError: The disk refuses.
         """
         if (channel := self._channels.get(topic)) is None:
             channel = self._msgpack_channel(topic, message_name)
-        self._add(channel, payload, sequence, publish_time_ns)
+        self._add(channel, payload, sequence, publish_time_ns, log_time_ns)
 
-    def add_image(self, topic: str, view: View) -> None:
-        """Adds a view's picture as viewers know it.
+    def add_shown(
+        self,
+        shown: Shown,
+        sequence: int,
+        publish_time_ns: int | None = None,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """Adds a message for viewers; times and number are of the message that it is of.
 
         Raises:
             OSError: The disk refuses.
         """
-        if (channel := self._channels.get(topic)) is None:
-            channel = self._image_channel(topic)
-        publish_time_ns = to_ns(view.unix_secs)
-        image = CompressedImage(
-            timestamp=Timestamp(*divmod(publish_time_ns, _NS_PER_SEC)),
-            frame_id=view.actor,
-            data=view.picture,
-            format=view.picture_format,
+        if (channel := self._channels.get(shown.topic)) is None:
+            if len(self._channels) >= MOST_CHANNELS:
+                self._leave_out(shown.topic)
+                return
+            channel = self._register(
+                shown.topic, shown.form.encoding, self._schema_of(shown.form), {}
+            )
+        self._add(channel, shown.payload, sequence, publish_time_ns, log_time_ns, shown.secs_before)
+
+    def copy(self, schema: Schema | None, channel: Channel, message: Message) -> None:
+        """Adds a message of another segment, under its topic and with its times.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        copied = self._channels.get(channel.topic)
+        if copied is None:
+            schema_id = 0 if schema is None else self._known_schema(schema)
+            copied = self._register(
+                channel.topic, channel.message_encoding, schema_id, channel.metadata
+            )
+        self._mcap.add_message(
+            copied, message.log_time, message.data, message.publish_time, message.sequence
         )
-        self._add(channel, image.encode(), view.sequence, publish_time_ns)
-
-    def copy(self, record: Schema | Channel | Message) -> None:
-        """Adds a record of another segment, with its times.
-
-        Raises:
-            OSError: The disk refuses.
-        """
-        match record:
-            case Schema():
-                self._copied_schemas[record.id] = self._mcap.register_schema(
-                    record.name, record.encoding, record.data
-                )
-            case Channel():
-                schema = self._copied_schemas[record.schema_id]
-                self._copied_channels[record.id] = self._mcap.register_channel(
-                    record.topic, record.message_encoding, schema, record.metadata
-                )
-            case Message():
-                self._mcap.add_message(
-                    self._copied_channels[record.channel_id],
-                    record.log_time,
-                    record.data,
-                    record.publish_time,
-                    record.sequence,
-                )
 
     def flush(self) -> None:
         """Makes everything so far durable.
@@ -168,14 +178,20 @@ class SegmentWriter:
         self._mcap.flush()  # type: ignore[no-untyped-call]  # mcap leaves its return type out
         self._file.sync()
 
-    def finish(self, facts: Facts) -> None:
+    def finish(self, facts: Facts, excerpt: Excerpt | None = None) -> None:
         """Adds what is told of the segment, and its index; durable on return. Then `close`.
+
+        Args:
+            facts: Of the segment.
+            excerpt: What it was copied from, if it is no recorder's.
 
         Raises:
             OSError: The disk refuses.
         """
         self._mcap.flush()  # type: ignore[no-untyped-call]  # likewise
         self._mcap.add_metadata(FACTS_METADATA, facts.to_metadata())
+        if excerpt is not None:
+            self._mcap.add_metadata(EXCERPT_METADATA, excerpt.to_metadata())
         self._mcap.finish()  # type: ignore[no-untyped-call]  # likewise
         self._file.sync()
 
@@ -184,31 +200,56 @@ class SegmentWriter:
         self._file.close()
 
     def _add(
-        self, channel: int, payload: bytes, sequence: int, publish_time_ns: int | None
+        self,
+        channel: int,
+        payload: bytes,
+        sequence: int,
+        publish_time_ns: int | None,
+        log_time_ns: int | None,
+        secs_before: float = 0.0,
     ) -> None:
-        now_ns = max(0, time.time_ns())
+        now_ns, before_ns = time.time_ns(), round(secs_before * _NS_PER_SEC)
+        logged_ns = now_ns if log_time_ns is None else log_time_ns
         published_ns = now_ns if publish_time_ns is None else publish_time_ns
-        self._mcap.add_message(channel, now_ns, payload, published_ns, sequence % _SEQUENCE_MODULUS)
+        self._mcap.add_message(
+            channel,
+            max(0, logged_ns - before_ns),
+            payload,
+            max(0, published_ns - before_ns),
+            sequence % SEQUENCE_MODULUS,
+        )
 
     def _msgpack_channel(self, topic: str, message_name: str) -> int:
-        name = f"clothbus.{message_name}"
-        if name not in self._schemas:
-            self._schemas[name] = self._mcap.register_schema(name, "", b"")
-        metadata = {"message": message_name, "schema_version": str(SCHEMA_VERSION)}
-        return self._register(topic, MESSAGE_ENCODING, self._schemas[name], metadata)
+        schema, channel = channel_of(topic, message_name)
+        known = self._known_schema(schema)
+        return self._register(topic, channel.message_encoding, known, channel.metadata)
 
-    def _image_channel(self, topic: str) -> int:
-        schema = CompressedImage.get_schema()
+    def _leave_out(self, topic: str) -> None:
+        if not self._has_left_out:
+            _log.warning("%s: viewers will miss %r: there are too many topics", self.path, topic)
+        self._has_left_out = True
+
+    def _schema_of(self, form: Form) -> int:
+        return self._known_schema(Schema(0, form.schema, form.schema_encoding, form.schema_name))
+
+    def _known_schema(self, schema: Schema) -> int:
         if schema.name not in self._schemas:
             self._schemas[schema.name] = self._mcap.register_schema(
                 schema.name, schema.encoding, schema.data
             )
-        return self._register(topic, "protobuf", self._schemas[schema.name], {})
+        return self._schemas[schema.name]
 
     def _register(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
         channel = self._mcap.register_channel(topic, encoding, schema, metadata)
         self._channels[topic] = channel
         return channel
+
+
+def channel_of(topic: str, message_name: str) -> tuple[Schema, Channel]:
+    """What tells of the codec's messages of a topic; without numbers, which each file has anew."""
+    schema = Schema(0, b"", "", f"clothbus.{message_name}")
+    metadata = {MESSAGE_FIELD: message_name, SCHEMA_VERSION_FIELD: str(SCHEMA_VERSION)}
+    return schema, Channel(0, topic, MESSAGE_ENCODING, metadata, 0)
 
 
 def to_ns(unix_secs: float) -> int:

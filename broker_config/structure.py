@@ -24,10 +24,27 @@ _ARRAY_DTYPES = {"|u1": "uint8", "<i4": "int32", "<f4": "float32"}
 """What an array on the bus may hold, by numpy's type string (little endian, always)."""
 
 
+_ADDED = "added"
+
+
+def added(default: Any) -> Any:
+    """A field that older versions do not have: at its default it is left out of what is written.
+
+    So what is written by this version reads there as long as nothing of it is used, and names and
+    digests that follow from what is written stay what they were.
+    """
+    return dataclasses.field(default=default, metadata={_ADDED: True})
+
+
 def to_plain(value: object) -> object:
     """Turns a dataclass (or anything it may contain) into dicts, lists, scalars and bytes."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {name: to_plain(getattr(value, name)) for name in _field_types(type(value))}
+        usual = _added_defaults(type(value))
+        return {
+            name: to_plain(getattr(value, name))
+            for name in _field_types(type(value))
+            if name not in usual or getattr(value, name) != usual[name]
+        }
     if isinstance(value, np.ndarray):
         array = np.ascontiguousarray(value)
         return {"dtype": array.dtype.str, "shape": list(array.shape), "data": array.tobytes()}
@@ -162,6 +179,15 @@ def _convert_dataclass(plain: object, expected: type, path: str) -> object:
 def _field_types(expected: type) -> dict[str, Any]:
     hints = typing.get_type_hints(expected)
     return {field.name: hints[field.name] for field in dataclasses.fields(expected)}
+
+
+@functools.cache
+def _added_defaults(expected: type) -> dict[str, Any]:
+    return {
+        field.name: field.default
+        for field in dataclasses.fields(expected)
+        if _ADDED in field.metadata
+    }
 
 
 @functools.cache

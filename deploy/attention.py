@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.acting import Greedy
+from actors.cloth.masks import cloth_mask
 from actors.policy import Policy
 from actors.rollout import Start, rollout
 from actors.task import make_task_env
@@ -37,6 +39,17 @@ class AttendedStep:
     heat: NDArray[np.float32]
     """f32[H, W] in 0...1."""
     reward: float
+
+    @property
+    def heat_on_cloth(self) -> float:
+        """Portion of the heat that lies on cloth; nan where there is no heat."""
+        total = float(self.heat.sum())
+        return float(self.heat[cloth_mask(self.picture)].sum()) / total if total else math.nan
+
+    @property
+    def cloth_share(self) -> float:
+        """Portion of the picture that shows cloth: what heat would have on it by chance."""
+        return float(cloth_mask(self.picture).mean())
 
 
 def attend(preset: Preset, policy: Policy, episode: int, steps: int) -> list[AttendedStep]:
@@ -89,15 +102,24 @@ def draw_attention(path: Path, title: str, rows: Sequence[tuple[str, list[Attend
             above, below = grid[2 * number][column], grid[2 * number + 1][column]
             above.set_title(f"{column + 1}: action {step.action}, {step.reward:.2f}", fontsize=7)
             above.imshow(_as_rgb(step.picture))
-            below.imshow(_with_heat(step))
+            below.imshow(with_heat(step.picture, step.heat))
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
-def _with_heat(step: AttendedStep) -> NDArray[np.uint8]:
-    heat = cv2.applyColorMap((255 * step.heat).astype(np.uint8), cv2.COLORMAP_JET)[..., ::-1]
-    mixed = (1 - _HEAT_SHARE) * _as_rgb(step.picture) + _HEAT_SHARE * heat
+def with_heat(picture: NDArray[np.uint8], heat: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Lays heat over a picture.
+
+    Args:
+        picture: u8[H, W, C].
+        heat: f32[H, W] in 0...1.
+
+    Returns:
+        u8[H, W, 3], RGB.
+    """
+    coloured = cv2.applyColorMap((255 * heat).astype(np.uint8), cv2.COLORMAP_JET)[..., ::-1]
+    mixed = (1 - _HEAT_SHARE) * _as_rgb(picture) + _HEAT_SHARE * coloured
     return np.asarray(mixed.round().astype(np.uint8))
 
 

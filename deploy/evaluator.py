@@ -18,12 +18,11 @@ from dataclasses import dataclass
 
 from actors.cloth.engine import ClothEngineError
 from actors.policy import Policy
-from actors.service import StopRequested
 from broker_config.bus import Bus
 from broker_config.errors import AlreadyOwned, OwnerUnreachable, StorageError
 from broker_config.failpoints import Failpoint, reach
 from broker_config.heart import Heart, Pulse
-from broker_config.joining import attach
+from broker_config.joining import StopRequested, attach
 from broker_config.keys import ParsedKey
 from broker_config.latest import LatestReader
 from broker_config.messages import Heartbeat, Snapshot

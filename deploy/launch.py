@@ -143,7 +143,7 @@ class Supervisor:
         return False
 
     def stop(self) -> None:
-        """Ends what still lives: actors, then the learner, then the router.
+        """Ends what still lives: actors and their like, then the learner, then the router.
 
         A second Ctrl-C does not cut this short: what is left would outlive us.
         """
@@ -153,7 +153,9 @@ class Supervisor:
     def _stop_in_order(self) -> None:
         by_role: list[list[Supervised]] = [[], [], []]
         for supervised in self._processes.values():
-            rank = {"actor": 0, "evaluator": 0, "owner": 1}.get(supervised.spec.role, 2)
+            rank = {"actor": 0, "discriminator": 0, "evaluator": 0, "owner": 1}.get(
+                supervised.spec.role, 2
+            )
             by_role[rank].append(supervised)
         for group in by_role:
             self._terminate(group)

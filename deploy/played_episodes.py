@@ -13,10 +13,15 @@ import numpy as np
 
 from actors.envs import ClothbusEnv
 from actors.rollout import ActingPolicy
+from broker_config.errors import StorageError
+from broker_config.messages import Trajectory
 from deploy.process import end_with_parent
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+GUARDED_ATTEMPTS = 20
+"""Seeds after which an episode that the guard ends each time is given up."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,26 @@ def play_episode(env: ClothbusEnv, policy: ActingPolicy, number: int) -> PlayedE
         successes.index(True) + 1 if any(successes) else None,
         sum(rewards),
         numbers,
+    )
+
+
+def sound_episode(index: int, play: Callable[[int], Trajectory]) -> Trajectory:
+    """Plays an episode; one that the guard ends is played again on the next seed.
+
+    Args:
+        index: Of the episode, for the error.
+        play: Plays it with the seed of a generation, counted from 0.
+
+    Raises:
+        StorageError: No seed gives a sound episode.
+    """
+    for generation in range(GUARDED_ATTEMPTS):
+        played = play(generation)
+        if played.guard is None:
+            return played
+    raise StorageError(
+        f"episode {index}: expected a sound attempt with one of {GUARDED_ATTEMPTS} seeds; got "
+        f"{played.guard}; mend the task or the simulator"
     )
 
 

@@ -9,51 +9,24 @@ higher rate only adds mistakes to those of a lower one.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import FoldLinesEnv
 from actors.task import make_task_env
-from broker_config.durable import write_durably
-from broker_config.errors import MessageError, PresetError, StorageError
+from broker_config.errors import PresetError
+from broker_config.messages import Demonstrator, FoundQuality
 from broker_config.preset import TaskPreset
-from broker_config.structure import from_plain, to_plain
 from deploy.played_episodes import mapped, play_episode
 
 TOLERANCE: Final = 0.02
 MOST_HALVINGS: Final = 7
 FIRST_SEED: Final = 500_000
 """Of the episodes by which quality is measured: no run and no test of a task plays them."""
-QUALITY_FILE: Final = "quality.json"
-
-
-@dataclass(frozen=True)
-class Quality:
-    """A rate of mistakes, and what it is worth."""
-
-    wanted: float
-    mistake_rate: float
-    measured: float
-    chance_score: float
-    script_score: float
-    episodes: int
-    """By which each rate was measured."""
-    task: TaskPreset
-    """That was played."""
-
-    def __str__(self) -> str:
-        return (
-            f"quality {self.measured:.2f} (wanted {self.wanted:.2f}) with {self.mistake_rate:.1%} "
-            f"of the script's actions random, over {self.episodes} episodes; mean score of chance "
-            f"{self.chance_score:.2f}, of the script {self.script_score:.2f}"
-        )
 
 
 def find_quality(
@@ -62,8 +35,8 @@ def find_quality(
     episodes: int,
     jobs: int = 1,
     on_measured: Callable[[float, float], None] | None = None,
-) -> Quality:
-    """The rate of mistakes that gives a quality.
+) -> Demonstrator:
+    """The script with the rate of mistakes that gives a quality.
 
     Args:
         task: Which the demonstrator plays.
@@ -100,38 +73,9 @@ def find_quality(
             on_measured(rate, found[rate])
         low, high = (rate, high) if found[rate] > wanted else (low, rate)
     best = min(found, key=lambda rate: abs(found[rate] - wanted))
-    return Quality(wanted, best, found[best], chance, script, episodes, task)
-
-
-def kept_quality(
-    folder: Path, task: TaskPreset, wanted: float, episodes: int, jobs: int = 1
-) -> Quality:
-    """What the folder's file says, or else finds it and writes the file.
-
-    Raises:
-        PresetError: See `find_quality`.
-        StorageError: The file is of another quality or task, or cannot be read or written.
-    """
-    path = folder / QUALITY_FILE
-    if path.exists():
-        try:
-            kept = from_plain(json.loads(path.read_text()), Quality, QUALITY_FILE)
-        except (ValueError, MessageError) as error:
-            raise StorageError(f"{path}: expected a quality; got {error}; move it away") from error
-        if (kept.wanted, kept.episodes, kept.task) != (wanted, episodes, task):
-            raise StorageError(
-                f"{path}: expected quality {wanted:g} over {episodes} episodes of this task; got "
-                f"{kept.wanted:g} over {kept.episodes} of {kept.task.environment}; collect into "
-                "another folder"
-            )
-        return kept
-    found = find_quality(task, wanted, episodes, jobs)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_durably(path, (json.dumps(to_plain(found), indent=2) + "\n").encode())
-    except OSError as error:
-        raise StorageError(f"{path}: expected to write it; got {error}") from error
-    return found
+    return Demonstrator(
+        "scripted", best, FoundQuality(wanted, found[best], chance, script, episodes)
+    )
 
 
 def _mean_score(task: TaskPreset, episodes: int, jobs: int, mistake_rate: float) -> float:

@@ -52,7 +52,7 @@ class RecorderInbox:
 
     def offer(self, message: Live) -> None:
         """Takes a best-effort message, and waits for nobody."""
-        size = len(message.picture) if isinstance(message, View) else _OTHER_BYTES
+        size = _size_of(message)
         with self._changed:
             self._live.append((message, size))
             self._waiting_bytes += size
@@ -101,3 +101,10 @@ class RecorderInbox:
             self._is_closed = True
             self._part = None
             self._changed.notify_all()
+
+
+def _size_of(message: Live) -> int:
+    if not isinstance(message, View):
+        return _OTHER_BYTES
+    motion = message.motion
+    return len(message.picture) + (0 if motion is None else motion.angles_rad.nbytes)

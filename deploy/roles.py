@@ -10,6 +10,7 @@ from pathlib import Path
 from broker_config.bus import open_bus
 from broker_config.heart import HUNG_SECS, Pulse
 from broker_config.journal import Journal
+from broker_config.messages import IterationAnnounced, Rewards
 from broker_config.ownership import own_run
 from broker_config.preset import Preset
 from broker_config.session import open_router_on_free_port, open_session
@@ -18,7 +19,7 @@ from deploy.priority import Priority
 from deploy.process import interrupt, on_terminate, take_when_free, use_one_torch_thread
 from deploy.run_folder import RunFolder
 from deploy.status import only_run
-from learner.compute import ON_CPU, Compute
+from learner.steps.compute import ON_CPU, Compute
 
 _log = logging.getLogger(__name__)
 
@@ -99,13 +100,18 @@ def run_learner(
             pulse.beat()
             return owner.wait_ready(index, WAIT_SECS)
 
+        def wait_rewards(announced: IterationAnnounced) -> Rewards | None:
+            pulse.beat()
+            return owner.wait_rewards(announced, WAIT_SECS)
+
         loop = LearningLoop(
             owner,
             Trainer(preset, compute, pulse.beat),
             CheckpointStore(folder.checkpoints),
             snapshots,
-            read_demonstrations(demonstrations) if demonstrations else (),
+            read_demonstrations(demonstrations) if demonstrations else None,
             wait_ready,
+            wait_rewards,
         )
         LearnerService(
             bus, bulk_bus, "learner", owner, loop, journal, snapshots, metrics, pulse, hung_secs
@@ -160,6 +166,35 @@ def run_actor(
             spool_steps=spool_steps,
             wrap_env=lambda env: StepLog(env, step_log, incarnation) if step_log else env,
         )
+        on_terminate(process.stop)
+        has_finished = process.run()
+    if not has_finished:
+        interrupt()
+
+
+def run_discriminator(
+    address: str, discriminator: str, run: str | None = None, overrides: tuple[str, ...] = ()
+) -> None:
+    """Gives a run that imitates its rewards, until its last iteration has them.
+
+    Args:
+        address: The router's.
+        discriminator: This process's name.
+        run: The run, or None if the router carries only one.
+        overrides: Zenoh settings.
+
+    Raises:
+        AttachRefused: The owner's versions differ, or the run has a discriminator service.
+        OwnerUnreachable: The router carries no run, or several and none was named.
+        PresetError: The run does not imitate.
+        RouterUnreachable: There is no router at the address.
+    """
+    from discriminator.service import DiscriminatorService
+
+    use_one_torch_thread()
+    run = run or only_run(address, overrides)
+    with open_bus(address, run, "discriminator", discriminator, overrides) as bus:
+        process = DiscriminatorService(bus, discriminator, secrets.token_hex(8))
         on_terminate(process.stop)
         has_finished = process.run()
     if not has_finished:

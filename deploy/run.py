@@ -30,16 +30,18 @@ from deploy.recorder_farewell import RecorderFarewell
 from deploy.run_folder import RunFolder
 from deploy.summary import is_complete, summarise
 from deploy.topology import (
+    DISCRIMINATOR,
     EVALUATOR,
     RECORDER,
     actor_process,
+    discriminator_process,
     evaluator_process,
     learner_process,
     recorder_process,
     router_process,
 )
 from deploy.vital_signs import VitalSigns
-from learner.compute import ON_CPU, Compute
+from learner.steps.compute import ON_CPU, Compute
 
 ROUTER_START_SECS = 30.0
 LEAVE_SECS = 10.0
@@ -83,11 +85,11 @@ def run_over_bus(folder: RunFolder, preset: Preset, options: RunOptions, console
 
     def carry_out(progress: Progress) -> None:
         if not is_complete(folder):
-            _supervise(folder, options, progress)
+            _supervise(folder, preset, options, progress)
             return
         deliver_spools(folder, preset)
         if options.record and lacks_recording(folder):
-            _supervise(folder, replace(options, actors=0, evaluate=0), progress)
+            _supervise(folder, preset, replace(options, actors=0, evaluate=0), progress)
 
     return conduct(folder, preset, options.compute, console, carry_out)
 
@@ -116,7 +118,7 @@ def conduct(
     return summary.is_complete
 
 
-def _supervise(folder: RunFolder, options: RunOptions, progress: Progress) -> None:
+def _supervise(folder: RunFolder, preset: Preset, options: RunOptions, progress: Progress) -> None:
     is_resumed = folder.journal.exists()
     signs = VitalSigns(options.hung_secs)
     with Supervisor(folder.path / "logs", signs) as supervisor:
@@ -129,14 +131,17 @@ def _supervise(folder: RunFolder, options: RunOptions, progress: Progress) -> No
             recorder = RecorderFarewell(bus, RECORDER) if options.record else None
             if is_resumed:
                 _unpause(supervisor, bus)
-            actors = _start_actors(supervisor, folder, address, options)
+            workers = _start_actors(supervisor, folder, address, options)
+            if preset.has_discriminators and options.actors:
+                supervisor.start(discriminator_process(folder.run, address, options.overrides))
+                workers.append(DISCRIMINATOR)
             _watch(supervisor, bus, progress)
-            supervisor.release(actors)
+            supervisor.release(workers)
             if evaluator is not None:
                 evaluator.wait(supervisor, progress)
             if recorder is not None:
                 recorder.wait(supervisor)
-        supervisor.wait_ended(actors, LEAVE_SECS)
+        supervisor.wait_ended(workers, LEAVE_SECS)
 
 
 def _start_learner(

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from broker_config.errors import StorageError
+from broker_config.errors import PresetError, StorageError
 from broker_config.preset import Preset, preset_from_json
 
 _NOT_IN_AN_ID = re.compile(r"[^a-z0-9_-]+")
@@ -65,6 +65,16 @@ class RunFolder:
         return self.path / "recording"
 
     @property
+    def offline(self) -> Path:
+        """What the run learns from, if it does not act: recordings."""
+        return self.path / "offline.json"
+
+    @property
+    def compute(self) -> Path:
+        """On what and by which path the run is trained, in words."""
+        return self.path / "compute.txt"
+
+    @property
     def router_address(self) -> Path:
         """Where the embedded router of the run listens."""
         return self.path / "router.address"
@@ -109,6 +119,25 @@ class RunFolder:
                 f"{self.path}: expected a run folder with preset.json; got none; "
                 "name a folder that `clothbus run` made"
             ) from error
+
+
+def require_acting(folder: RunFolder) -> None:
+    """Refuses to go on by acting with what has learned from recordings.
+
+    Raises:
+        PresetError: The folder's run learns from recordings.
+    """
+    if folder.offline.exists():
+        raise PresetError(
+            f"{folder.path}: expected a run that acts; got one that learns from recordings; go on "
+            f"with `clothbus train --from SOURCES --output {folder.path}`"
+        )
+
+
+def router_address(connect: str) -> str:
+    """An address as it is, or the one that a run folder holds in a file."""
+    file = RunFolder(Path(connect)).router_address
+    return file.read_text().strip() if file.is_file() else connect
 
 
 def create_run_folder(runs: Path, preset: Preset) -> RunFolder:

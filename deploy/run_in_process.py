@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 
 from rich.console import Console
@@ -12,7 +13,12 @@ from broker_config.journal import Journal
 from broker_config.messages import Command, Control
 from broker_config.ownership import own_run
 from broker_config.preset import Preset
-from deploy.in_process import ACTOR, InProcessActor
+from deploy.in_process import (
+    ACTOR,
+    AnsweringActor,
+    InProcessActor,
+    InProcessDiscriminators,
+)
 from deploy.leftovers import deliver_spools
 from deploy.process import take_when_free, use_one_torch_thread
 from deploy.progress import Progress
@@ -23,8 +29,9 @@ from learner.checkpoint import CheckpointStore
 from learner.learning import LearningLoop
 from learner.metrics import LearningMetrics
 from learner.owner import Owner
-from learner.recorded import read_demonstrations
+from learner.recorded import Demonstrations, read_demonstrations
 from learner.snapshots import SnapshotStore
+from learner.steps.compute import Compute
 from learner.trainer import Trainer
 
 
@@ -47,24 +54,55 @@ def run_in_process(
 
 
 def _play(folder: RunFolder, preset: Preset, options: RunOptions, progress: Progress) -> None:
-    use_one_torch_thread()
     task = make_task_env(preset.task)
+    with closing(StepLog(task, options.step_log, ACTOR) if options.step_log else task) as env:
+
+        def make_actor(owner: Owner, snapshots: SnapshotStore) -> AnsweringActor:
+            return InProcessActor(owner, env, snapshots)
+
+        given = options.demonstrations
+        demonstrations = read_demonstrations(given) if given else None
+        learn_in_process(folder, preset, options.compute, demonstrations, make_actor, progress)
+
+
+def learn_in_process(
+    folder: RunFolder,
+    preset: Preset,
+    compute: Compute,
+    demonstrations: Demonstrations | None,
+    make_actor: Callable[[Owner, SnapshotStore], AnsweringActor],
+    progress: Progress,
+) -> None:
+    """Learns in this process until the run is complete, or goes on with it.
+
+    Args:
+        folder: Of the run.
+        preset: Of the run.
+        compute: What the learner computes on.
+        demonstrations: For Algorithm 2 or for discriminators.
+        make_actor: Makes whoever answers the tickets.
+        progress: Told of all that happens.
+    """
+    use_one_torch_thread()
     with (
         take_when_free(lambda: own_run(folder.path)),
         Journal(folder.journal) as journal,
         LearningMetrics(folder.tensorboard) as metrics,
-        closing(StepLog(task, options.step_log, ACTOR) if options.step_log else task) as env,
     ):
         owner = Owner(folder.run, preset, journal)
         owner.control(Control(Command.RESUME))
         snapshots = SnapshotStore(folder.snapshots)
+        discriminators = (
+            InProcessDiscriminators(owner, journal) if preset.has_discriminators else None
+        )
         loop = LearningLoop(
             owner,
-            Trainer(preset, options.compute),
+            Trainer(preset, compute),
             CheckpointStore(folder.checkpoints),
             snapshots,
-            read_demonstrations(options.demonstrations) if options.demonstrations else (),
-            InProcessActor(owner, env, snapshots).play_until_ready,
+            demonstrations,
+            make_actor(owner, snapshots).play_until_ready,
+            discriminators.wait_rewards if discriminators else None,
         )
         for event in loop:
             metrics.note(event)

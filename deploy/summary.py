@@ -129,7 +129,9 @@ def _lines(
 ) -> list[str]:
     number, per_iteration = len(episodes.returns), preset.schedule.episodes_per_iteration
     first, last = slice(0, per_iteration), slice(max(0, number - per_iteration), number)
-    then = "evaluate" if is_complete else "run --resume"
+    is_offline = folder.offline.exists()
+    resume = "train --from SOURCES --output" if is_offline else "run --resume"
+    then = "evaluate" if is_complete else resume
     return [
         f"{'Finished' if is_complete else 'Stopped'}: {preset.name} ({preset.source})",
         f"  episodes     {number} of {preset.schedule.episodes}, "

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from broker_config.errors import PresetError, StorageError
 from broker_config.preset import toml_value
+from deploy.option_rules import require_positive
 from deploy.process import FAILED_CHECK_EXIT
 
 Options = Annotated[tuple[str, ...], tyro.conf.arg(name="set")]
@@ -35,9 +36,8 @@ def task(
     """
     from deploy.task_check import check_task
 
-    for option, value in (("episodes", episodes), ("jobs", jobs)):
-        if value < 1:
-            raise PresetError(f"--{option}: expected at least 1; got {value}")
+    require_positive("episodes", episodes)
+    require_positive("jobs", jobs)
     try:
         check = check_task(_whole_id(env_id), _parsed(options), episodes, jobs)
     except ValueError as error:

@@ -9,10 +9,13 @@ from pathlib import Path
 from broker_config.heart import HUNG_SECS
 from broker_config.messages import Role
 from deploy.priority import Priority
-from learner.compute import ON_CPU, Compute
+from learner.steps.compute import ON_CPU, Compute
 
 RECORDER = "recorder"
 """Under which name a run's own recorder is there."""
+
+DISCRIMINATOR = "discriminator"
+"""Under which name the discriminators of a run are there."""
 
 EVALUATOR = "evaluator"
 """Under which name a run's own evaluator is there."""
@@ -67,6 +70,12 @@ def actor_process(
     arguments = ("actor", "--run", run, "--id", actor, "--connect", address, "--spool", str(spool))
     logged = ("--step-log", str(step_log)) if step_log else ()
     return ProcessSpec("actor", actor, (*arguments, *logged, *_zenoh(overrides)))
+
+
+def discriminator_process(run: str, address: str, overrides: tuple[str, ...] = ()) -> ProcessSpec:
+    """The discriminators of a run that imitates."""
+    arguments = ("discriminator", "--run", run, "--connect", address)
+    return ProcessSpec("discriminator", DISCRIMINATOR, (*arguments, *_zenoh(overrides)))
 
 
 def recorder_process(

@@ -17,6 +17,7 @@ _CONVOLUTIONS = ((8, 8, 4), (16, 4, 2), (16, 3, 1))
 _HIDDEN_UNITS = 64
 _SLOPE = 0.2
 """Of the leaky ReLU below 0."""
+_EVALUATED_AT_ONCE = 256
 
 
 class DiscriminatorNetwork(nn.Module):
@@ -75,3 +76,17 @@ def build_discriminator(
 def as_input(pictures: Tensor) -> Tensor:
     """Pictures u8[B, H, W, C] as f32[B, C, H, W] in 0...1."""
     return pictures.permute(0, 3, 1, 2).to(torch.float32) / 255.0
+
+
+@torch.no_grad()
+def logits_of(network: DiscriminatorNetwork, states: Tensor) -> Tensor:
+    """Logits of states as they are, f32[n]; the network stays as it is.
+
+    Args:
+        network: In training mode, and again so afterwards.
+        states: u8[n, H, W, C].
+    """
+    network.eval()  # spectral norm takes no step of its own
+    parts = [network(as_input(part)) for part in torch.split(states, _EVALUATED_AT_ONCE)]
+    network.train()
+    return torch.cat(parts)

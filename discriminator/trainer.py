@@ -5,7 +5,7 @@ Source: algorithm 4. Its positives are states alone: what was demonstrated for D
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,23 +20,29 @@ from broker_config.seeds import (
     TARGET_DISCRIMINATOR_STREAM,
     stream_seed,
 )
-from discriminator.augmentation import colour_jitter, random_shift
+from discriminator.augmentation import augmented
 from discriminator.losses import (
     accuracy,
     discriminator_loss,
     gradient_penalty,
     non_negative_loss,
 )
-from discriminator.networks import as_input, build_discriminator
+from discriminator.networks import as_input, build_discriminator, logits_of
 from discriminator.rewards import join_rewards
 
 Positives = Literal["expert", "target"]
 
-_EVALUATED_AT_ONCE = 256
 _STREAMS: dict[Positives, int] = {
     "expert": EXPERT_DISCRIMINATOR_STREAM,
     "target": TARGET_DISCRIMINATOR_STREAM,
 }
+
+
+def taking_part(imitation: ImitationPreset) -> tuple[Positives, ...]:
+    """The discriminators of an imitation, by what is real to them."""
+    if imitation.discriminators == "both":
+        return ("expert", "target")
+    return (imitation.discriminators,)
 
 
 @dataclass(frozen=True)
@@ -53,30 +59,35 @@ class DiscriminatorReport:
 class Discriminators:
     """Those that take part in an imitation: D_E, D_T or both."""
 
-    def __init__(self, preset: Preset, real: Mapping[Positives, Tensor]) -> None:
+    def __init__(
+        self,
+        preset: Preset,
+        real: Mapping[Positives, Tensor],
+        on_step: Callable[[], None] = lambda: None,
+    ) -> None:
         """Makes untrained discriminators.
 
         Args:
             preset: With an [imitation] table.
             real: Pictures u8[n, H, W, C] of demonstrated states and of target states, as far as
                 the preset's discriminators need them.
+            on_step: Called after every minibatch, to show that an update gets on.
 
         Raises:
             MessageError: Pictures are missing, none, or of another shape or dtype.
         """
         assert preset.imitation is not None  # who imitates, has a table
         self._imitation: ImitationPreset = preset.imitation
-        wanted: tuple[Positives, ...] = ("expert", "target")
-        if preset.imitation.discriminators != "both":
-            wanted = (preset.imitation.discriminators,)
         shape = preset.task.observation_shape
         self._each = {
             name: _Discriminator(
                 _checked(name, real.get(name), shape),
                 preset.imitation.discriminator,
                 stream_seed(preset.seed, _STREAMS[name]),
+                preset.imitation.discriminator.target_prior if name == "target" else 0.0,
+                on_step,
             )
-            for name in wanted
+            for name in taking_part(preset.imitation)
         }
 
     @property
@@ -99,7 +110,7 @@ class Discriminators:
         Args:
             states: u8[n, H, W, C].
         """
-        return {name: it.logits(states) for name, it in self._each.items()}
+        return {name: logits_of(it.network, states) for name, it in self._each.items()}
 
     def rewards(self, states: Tensor) -> Tensor:
         """The reward of each transition into these states, f32[n]: eq. 4.3.
@@ -111,13 +122,7 @@ class Discriminators:
 
     def weights_bytes(self) -> bytes:
         """All networks' weights as a snapshot carries them."""
-        return safetensors.torch.save(
-            {
-                f"{name}.{part}": tensor.contiguous().clone()
-                for name, it in self._each.items()
-                for part, tensor in it.network.state_dict().items()
-            }
-        )
+        return safetensors.torch.save(network_weights(self.get_state()))
 
     def get_state(self) -> dict[str, Tensor]:
         """Everything that `set_state` needs to go on bit-identically."""
@@ -152,11 +157,28 @@ class Discriminators:
             )
 
 
+def network_weights(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The networks' part of a state of `get_state`; names begin with `expert.` or `target.`."""
+    parts = ((name.split(".", 2), tensor) for name, tensor in state.items())
+    return {
+        f"{path[0]}.{path[2]}": tensor.contiguous()
+        for path, tensor in parts
+        if path[1] == "network"
+    }
+
+
 class _Discriminator:
     """One network and what is real to it."""
 
-    def __init__(self, real: Tensor, preset: DiscriminatorPreset, seed: int) -> None:
-        self._real, self._preset = real, preset
+    def __init__(
+        self,
+        real: Tensor,
+        preset: DiscriminatorPreset,
+        seed: int,
+        prior: float,
+        on_step: Callable[[], None],
+    ) -> None:
+        self._real, self._preset, self._prior, self._on_step = real, preset, prior, on_step
         height, width, channels = real.shape[1:]
         self.network = build_discriminator(
             (height, width, channels), seed, spectral_norm=preset.spectral_norm
@@ -185,17 +207,21 @@ class _Discriminator:
         for batch in torch.cat((order, filling)).view(-1, size):
             picked = torch.randint(len(generated), (size,), generator=self._generator)
             loss, portion = self._step(self._real[batch], generated[picked])
+            self._on_step()
             losses.append(loss)
             portions.append(portion)
         return sum(losses) / len(losses), sum(portions) / len(portions)
 
     def _step(self, real: Tensor, generated: Tensor) -> tuple[float, float]:
-        real_pictures, generated_pictures = self._seen(real), self._seen(generated)
+        real_pictures, generated_pictures = (
+            augmented(as_input(states), self._preset, self._generator)
+            for states in (real, generated)
+        )
         logits = self.network(torch.cat((generated_pictures, real_pictures)))
         of_generated, of_real = logits[: len(generated)], logits[len(generated) :]
         preset = self._preset
-        if preset.target_prior > 0:
-            loss = non_negative_loss(of_generated, of_real, preset.target_prior)
+        if self._prior > 0:
+            loss = non_negative_loss(of_generated, of_real, self._prior)
         else:
             loss = discriminator_loss(of_generated, of_real)
         total = loss
@@ -205,19 +231,6 @@ class _Discriminator:
         total.backward()  # type: ignore[no-untyped-call]
         self._optimiser.step()
         return loss.item(), accuracy(of_generated.detach(), of_real.detach())
-
-    def _seen(self, states: Tensor) -> Tensor:
-        """Pictures as the network sees them in training: shifted and of other colours."""
-        shifted = random_shift(as_input(states), self._preset.random_shift_px, self._generator)
-        return colour_jitter(shifted, self._preset.colour_jitter, self._generator)
-
-    @torch.no_grad()
-    def logits(self, states: Tensor) -> Tensor:
-        """f32[n] of u8[n, H, W, C], as they are."""
-        self.network.eval()  # spectral norm takes no step of its own
-        parts = [self.network(as_input(part)) for part in torch.split(states, _EVALUATED_AT_ONCE)]
-        self.network.train()
-        return torch.cat(parts)
 
     def get_state(self) -> dict[str, Tensor]:
         """Weights, the optimiser's state and the random state."""

@@ -13,10 +13,13 @@ from torch.nn import functional
 from actors.networks import PreferenceNetwork, build_network
 from broker_config.errors import MessageError
 from broker_config.messages import Trajectory
-from broker_config.preset import Preset
+from broker_config.preset import DiscriminatorPreset, Preset
 from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
+from discriminator.augmentation import augmented
+from discriminator.networks import as_input
 from learner.memory import LocalMemory
-from learner.optimiser import build_optimiser
+from learner.minibatches import shuffled
+from learner.steps.optimiser import build_optimiser
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ def cloning_loss(
 
     Args:
         network: Gives P.
-        observations: u8[B, H, W, C].
+        observations: u8[B, H, W, C], or the same already as f32 in 0...255.
         actions: i64[B].
         beta: Inverse temperature.
     """
@@ -55,6 +58,7 @@ def clone(
     preset: Preset,
     demonstrations: Iterable[Trajectory],
     epochs: int,
+    augmentation: DiscriminatorPreset | None = None,
 ) -> Cloned:
     """Trains a policy to choose what the demonstrations chose.
 
@@ -64,6 +68,8 @@ def clone(
         preset: Gives network, optimiser, minibatch size and seed.
         demonstrations: At least one.
         epochs: How often each sample is learned from.
+        augmentation: Pictures are shifted and of other colours as these discriminators see them;
+            with None they are learned from as they are.
 
     Raises:
         MessageError: There are no demonstrations.
@@ -79,17 +85,25 @@ def clone(
     )
     optimiser = build_optimiser(preset.optimiser, network)
     shuffling = torch.Generator().manual_seed(stream_seed(preset.seed, SHUFFLING_STREAM))
-    batch_size = min(preset.schedule.minibatch_size, len(memory))
-    n_batches = len(memory) // batch_size
     losses: list[float] = []
     for _ in range(epochs):
-        order = torch.randperm(len(memory), generator=shuffling)[: n_batches * batch_size]
-        for batch in order.view(-1, batch_size):
+        batches = shuffled(len(memory), preset.schedule.minibatch_size, shuffling)
+        for batch in batches:
             picked = memory.minibatch(batch)
-            loss = cloning_loss(network, picked.observations, picked.actions, preset.algorithm.beta)
+            seen = picked.observations
+            if augmentation is not None:
+                seen = _augmented(seen, augmentation, shuffling)
+            loss = cloning_loss(network, seen, picked.actions, preset.algorithm.beta)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
             losses.append(loss.item())
     weights = {name: part.detach().clone() for name, part in network.state_dict().items()}
-    return Cloned(weights, epochs * n_batches, float(np.mean(losses[-n_batches:])))
+    return Cloned(weights, len(losses), float(np.mean(losses[-len(batches) :])))
+
+
+def _augmented(
+    observations: Tensor, preset: DiscriminatorPreset, generator: torch.Generator
+) -> Tensor:
+    """Pictures f32[B, H, W, C] in 0...255, as the network takes them, of u8[B, H, W, C]."""
+    return 255.0 * augmented(as_input(observations), preset, generator).permute(0, 2, 3, 1)

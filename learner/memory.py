@@ -54,8 +54,11 @@ class LocalMemory:
     A trajectory of T samples has T + 1 pictures, and each is stored once though it is the s' of one
     sample and the s of the next. Samples age one by one: a trajectory loses its oldest first.
 
-    The pictures lie in a ring that is allocated once. It holds 2 * capacity of them, which is what
-    is needed when every trajectory has a single sample; its address never changes.
+    What is there when `hold` is called stays for good, as the oldest; others age beside it.
+
+    The pictures lie in a ring that is allocated once. It has room for 2 * capacity of them, which
+    is what is needed when every trajectory has a single sample; its address never changes. Pictures
+    that stay lie at its beginning, and the others go round behind them.
     """
 
     def __init__(
@@ -66,8 +69,10 @@ class LocalMemory:
         self.capacity = capacity
         self.device = torch.device(device)
         self.ring = torch.zeros((2 * capacity, *observation_shape), dtype=torch.uint8).to(device)
-        self._first = 0  # where in the ring the oldest sample's picture is
+        self._first = 0  # where the oldest picture is, among the places that are gone round in
         self._n_frames = 0
+        self._n_held = 0
+        self._held_frames = 0
         self._samples = Samples(
             torch.empty(0, dtype=torch.int64, device=device),
             torch.empty(0, dtype=torch.int64, device=device),
@@ -86,16 +91,43 @@ class LocalMemory:
     @property
     def ring_positions(self) -> Tensor:
         """Where in `ring` each sample's s is, i64[n]."""
-        return (self._samples.positions + self._first) % len(self.ring)
+        return self._places(self._samples.positions)
 
     def live_frames(self, start: int, stop: int) -> Tensor:
         """Pictures start...stop-1 of those in use, oldest first, u8[stop - start, H, W, C]."""
-        first, last = self._first + start, self._first + min(stop, self._n_frames)
-        size = len(self.ring)
+        held, stop = self._held_frames, min(stop, self._n_frames)
+        if stop <= held and start < held:
+            return self.ring[start:stop]
+        ageing = self._ageing_frames(max(start - held, 0), stop - held)
+        return torch.cat((self.ring[start:held], ageing)) if start < held else ageing
+
+    def _ageing_frames(self, start: int, stop: int) -> Tensor:
+        ring = self._ageing_ring
+        first, last, size = self._first + start, self._first + stop, len(ring)
         if first < size < last:
-            return torch.cat((self.ring[first:], self.ring[: last - size]))
+            return torch.cat((ring[first:], ring[: last - size]))
         wrapped = size if first >= size else 0
-        return self.ring[first - wrapped : last - wrapped]
+        return ring[first - wrapped : last - wrapped]
+
+    @property
+    def n_held(self) -> int:
+        """Samples that stay for good: the oldest."""
+        return self._n_held
+
+    def hold(self) -> None:
+        """Keeps all samples that are there now for good; only those to come will age.
+
+        Raises:
+            MessageError: There are none, some are held already, or there is no room for others.
+        """
+        n_samples = len(self)
+        if self._n_held or not 0 < n_samples < self.capacity:
+            raise MessageError(
+                f"memory: expected 1 to {self.capacity - 1} samples to hold, and none held before; "
+                f"got {n_samples}, {self._n_held} of them held; hold once, and fewer than fit"
+            )
+        self.ring[: self._n_frames] = self.live_frames(0, self._n_frames).clone()
+        self._first, self._n_held, self._held_frames = 0, n_samples, self._n_frames
 
     @property
     def n_frames(self) -> int:
@@ -109,7 +141,7 @@ class LocalMemory:
         rewards: NDArray[np.float32],
         terminated: bool,
     ) -> None:
-        """Adds a trajectory; the oldest samples go where more than `capacity` would be kept.
+        """Adds a trajectory; the oldest that age go where more than `capacity` would be kept.
 
         Args:
             observations: u8[T+1, H, W, C]; T is at least 1.
@@ -121,7 +153,7 @@ class LocalMemory:
             MessageError: A shape or dtype is another, or a reward is not finite.
         """
         self._check_trajectory(observations, actions, rewards)
-        n_new = min(len(actions), self.capacity)
+        n_new = min(len(actions), self.capacity - self._n_held)
         self._drop_oldest(max(0, len(self) + n_new - self.capacity))
         ends = torch.zeros(n_new, dtype=torch.bool)
         ends[-1] = terminated
@@ -137,18 +169,18 @@ class LocalMemory:
 
     def minibatch(self, indices: Tensor) -> Minibatch:
         """The samples with these indices (0 is the oldest), i64[B]."""
-        samples, here = self._samples, self.ring_positions[indices]
+        samples, here = self._samples, self._samples.positions[indices]
         return Minibatch(
-            self.ring[here],
+            self.ring[self._places(here)],
             samples.actions[indices],
             samples.rewards[indices],
-            self.ring[(here + 1) % len(self.ring)],
+            self.ring[self._places(here + 1)],
             samples.terminated[indices],
         )
 
     def states_after(self) -> Tensor:
         """The picture after each sample, u8[n, H, W, C], oldest first."""
-        return self.ring[(self.ring_positions + 1) % len(self.ring)]
+        return self.ring[self._places(self._samples.positions + 1)]
 
     def replace_rewards(self, rewards: Tensor) -> None:
         """Gives every sample a new reward, oldest first: Algorithm 4 labels anew.
@@ -175,7 +207,9 @@ class LocalMemory:
 
     def get_state(self) -> dict[str, Tensor]:
         """Everything that `set_state` needs, as tensors on the CPU."""
+        held = {"held": torch.tensor(self._n_held)} if self._n_held else {}
         return {
+            **held,
             "frames": self.live_frames(0, self._n_frames).cpu().clone(),
             "positions": self._samples.positions.cpu(),
             "actions": self._samples.actions.cpu(),
@@ -191,6 +225,8 @@ class LocalMemory:
         """
         self.check_valid(state)
         self._first, self._n_frames = 0, len(state["frames"])
+        self._n_held = int(state["held"]) if "held" in state else 0
+        self._held_frames = int(state["positions"][self._n_held - 1]) + 2 if self._n_held else 0
         self.ring[: self._n_frames] = state["frames"].to(self.device)
         self._samples = Samples(
             *(state[name].to(self.device, copy=True) for name in Samples.__dataclass_fields__)
@@ -210,6 +246,8 @@ class LocalMemory:
             "rewards": (torch.float32, (n_samples,)),
             "terminated": (torch.bool, (n_samples,)),
         }
+        if "held" in state:
+            expected["held"] = torch.int64, ()
         if state.keys() != expected.keys():
             raise _invalid(f"the parts {sorted(expected)}", f"{sorted(state)}")
         for name, (dtype, shape) in expected.items():
@@ -220,6 +258,8 @@ class LocalMemory:
             if not fits or got.dtype != dtype:
                 raise _invalid(f"{name} {dtype} {shape}", f"{got.dtype} {list(got.shape)}")
         self._check_positions(state["positions"], len(state["frames"]))
+        if "held" in state:
+            self._check_held(int(state["held"]), state["positions"])
 
     def _check_positions(self, positions: Tensor, n_frames: int) -> None:
         if len(positions) > self.capacity:
@@ -233,6 +273,13 @@ class LocalMemory:
         in_order = positions[0] == 0 and bool(((steps == 1) | (steps == 2)).all())
         if not in_order or n_frames != int(positions[-1]) + 2:
             raise _invalid("samples in order, with all their pictures", "positions that are not")
+
+    def _check_held(self, n_held: int, positions: Tensor) -> None:
+        if not 1 <= n_held <= min(len(positions), self.capacity - 1):
+            raise _invalid("to hold some of its samples, and room for others", f"{n_held} held")
+        ageing = positions[n_held:]
+        if len(ageing) and int(ageing[0]) != int(positions[n_held - 1]) + 2:
+            raise _invalid("to hold whole trajectories", f"{n_held} samples that end inside one")
 
     def _check_trajectory(
         self,
@@ -257,24 +304,40 @@ class LocalMemory:
         if not np.isfinite(rewards).all():
             raise MessageError("trajectory.rewards: expected finite numbers; got some that are not")
 
+    @property
+    def _ageing_ring(self) -> Tensor:
+        """The places that are gone round in."""
+        return self.ring[self._held_frames :]
+
+    def _places(self, positions: Tensor) -> Tensor:
+        """Where in `ring` the live pictures at these positions are, of the same shape."""
+        held = self._held_frames
+        behind = held + (positions - held + self._first) % (len(self.ring) - held)
+        return torch.where(positions < held, positions, behind) if held else behind
+
     def _drop_oldest(self, n_dropped: int) -> None:
+        """Drops so many of the samples that age, and the pictures that only they had."""
         if n_dropped == 0:
             return
-        kept = Samples(*(part[n_dropped:] for part in _parts(self._samples)))
-        gone = self._n_frames if len(kept.positions) == 0 else int(kept.positions[0])
-        self._first = (self._first + gone) % len(self.ring)
+        held, ageing = self._n_held, self._n_held + n_dropped
+        kept = Samples(*(torch.cat((it[:held], it[ageing:])) for it in _parts(self._samples)))
+        is_left = len(kept.positions) > held
+        gone = (int(kept.positions[held]) if is_left else self._n_frames) - self._held_frames
+        kept.positions[held:] -= gone
+        self._first = (self._first + gone) % len(self._ageing_ring)
         self._n_frames -= gone
-        self._samples = Samples(kept.positions - gone, kept.actions, kept.rewards, kept.terminated)
+        self._samples = kept
 
     def _append_samples(self, new: Samples) -> None:
         pairs = zip(_parts(self._samples), _parts(new), strict=True)
         self._samples = Samples(*(torch.cat((old, part.to(self.device))) for old, part in pairs))
 
     def _append_frames(self, frames: Tensor) -> None:
-        start = (self._first + self._n_frames) % len(self.ring)
-        n_before_end = min(len(frames), len(self.ring) - start)
-        self.ring[start : start + n_before_end] = frames[:n_before_end].to(self.device)
-        self.ring[: len(frames) - n_before_end] = frames[n_before_end:].to(self.device)
+        ring = self._ageing_ring
+        start = (self._first + self._n_frames - self._held_frames) % len(ring)
+        n_before_end = min(len(frames), len(ring) - start)
+        ring[start : start + n_before_end] = frames[:n_before_end].to(self.device)
+        ring[: len(frames) - n_before_end] = frames[n_before_end:].to(self.device)
         self._n_frames += len(frames)
 
 

@@ -8,7 +8,13 @@ from pathlib import Path
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch.utils.tensorboard.writer import FileWriter
 
-from learner.learning import EpisodeAbsorbed, PolicyReady
+from learner.learning import (
+    EpisodeAbsorbed,
+    IterationLabelled,
+    LearningEvent,
+    PolicyReady,
+    RewardsAwaited,
+)
 
 
 class LearningMetrics:
@@ -27,13 +33,17 @@ class LearningMetrics:
         self._began_secs = time.monotonic()
         self._transitions = 0
 
-    def note(self, event: PolicyReady | EpisodeAbsorbed) -> None:
+    def note(self, event: LearningEvent) -> None:
         """Takes in an event."""
         match event:
             case EpisodeAbsorbed():
                 new, self.step = self._of_episode(event), event.index + 1
             case PolicyReady():
                 new, self.step = _of_policy(event), event.absorbed
+            case IterationLabelled():
+                new, self.step = dict(event.rewards.numbers), event.absorbed
+            case RewardsAwaited():
+                return
         self.numbers.update(new)
         # One event for all: one for each number would cost more than absorbing the episode.
         values = [Summary.Value(tag=name, simple_value=number) for name, number in new.items()]

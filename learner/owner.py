@@ -1,35 +1,17 @@
 """The durable owner of a run: everything that counts is in its journal before anyone is told.
 
-Journal entries are named, and a name is appended at most once, so that every step may be repeated
-after a crash:
-
-====================================  ==============================================================
-`run/<epoch>`                         `RunStarted`
-`demonstration/<number>`              `Trajectory`, what the policy was initialised from
-`ticket/<index>/<attempt>`            `TicketIssued`
-`trajectory/<actor>/<inc.>/<seq.>`    `Trajectory`, every attempt that arrived
-`ended/<actor>/<inc.>/<seq.>`         `AttemptEnded`, in the transaction of its trajectory
-`lost/<index>/<attempt>`              `AttemptEnded` without a trajectory
-`reseeded/<index>/<generation>`       `TicketReseeded`
-`snapshot/<version>/<digest>`         `SnapshotTaken`
-`iteration/<number>`                  `IterationEnded`
-`control/<epoch>/<number>`            `Control`
-`follower/<id>/<epoch>/<number>`      `FollowerJoined`
-====================================  ==============================================================
+`learner.run_journal` names the entries.
 """
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future
 
-from broker_config.codec import decode, decode_any, encode
-from broker_config.errors import ClothbusError, StorageError
+from broker_config.codec import decode, decode_any
+from broker_config.errors import StorageError
 from broker_config.joining import refusal
-from broker_config.journal import Appended, Journal
+from broker_config.journal import Journal
 from broker_config.messages import (
     Ack,
     Attach,
@@ -39,10 +21,13 @@ from broker_config.messages import (
     ControlReply,
     FollowerJoined,
     Instruction,
+    IterationAnnounced,
     IterationEnded,
     JournalBatch,
     JournalRequest,
     Refusal,
+    Rewards,
+    RewardsAck,
     RunStarted,
     SnapshotTaken,
     Ticket,
@@ -59,14 +44,15 @@ from broker_config.preset import Preset
 from broker_config.version import VERSION
 from learner.arrivals import Arrivals, Received
 from learner.followers import Followers
+from learner.given_demonstrations import GivenDemonstrations
 from learner.recorded import trajectory_name
+from learner.reward_desk import RewardDesk
+from learner.run_journal import Committed, RunJournal, nothing_to_commit
 from learner.steering import Steering, spelled_out
 from learner.tickets import TicketBook, TicketEvent
 
-_log = logging.getLogger(__name__)
-
-MOST_GENERATIONS = 20
-"""A ticket whose seed was replaced this often will not be solved by one more."""
+_LARGE = ("trajectory/", "demonstration/", "announced/", "rewards/")
+"""Names of entries that are large, and of no use for the tickets."""
 
 
 class Owner:
@@ -74,7 +60,8 @@ class Owner:
 
     Thread-safe: the bus's threads and the learning thread share it. `changed` is notified, and
     `changes` grows, whenever a waiting ticket request or the learning loop may go on; `attempts`
-    counts those of this epoch that went wrong.
+    counts those of this epoch that went wrong; `given` are the run's demonstrations; `reward_desk`
+    is where discriminators deliver.
     """
 
     def __init__(self, run: str, preset: Preset, journal: Journal) -> None:
@@ -85,9 +72,9 @@ class Owner:
         """
         self.run = run
         self.preset = preset
-        self.changed = threading.Condition()
-        self.changes = 0
         self._journal = journal
+        self._record = RunJournal(journal)
+        self.changed, self.attempts = self._record.changed, self._record.attempts
         self._book = TicketBook(preset, self._issued_before)
         self._arrivals = Arrivals(journal)
         self._received = Received()
@@ -97,17 +84,25 @@ class Owner:
         self._joins = 0
         self._is_over = False
         self.followers = Followers()
-        self._failure: ClothbusError | None = None
-        self.attempts: Counter[Verdict] = Counter()
         self.epoch = self._replay() + 1
+        self.given = GivenDemonstrations(run, preset.network, journal, self._record.append)
+        self.reward_desk = RewardDesk(
+            journal,
+            lambda name, item: self._record.append((name, item)),
+            self.epoch,
+            self._record.note_change,
+        )
         started = RunStarted(run, self.epoch, preset.to_json(), VERSION)
-        self._append((f"run/{self.epoch}", started)).result()
+        self._record.append((f"run/{self.epoch}", started)).result()
+
+    @property
+    def changes(self) -> int:
+        """How often `changed` was notified."""
+        return self._record.changes
 
     def note_change(self) -> None:
         """Wakes whoever waits for something to happen."""
-        with self.changed:
-            self.changes += 1
-            self.changed.notify_all()
+        self._record.note_change()
 
     # Joining ----------------------------------------------------------------------------------
 
@@ -121,7 +116,7 @@ class Owner:
 
     def issue(
         self, request: TicketRequest, now_secs: float
-    ) -> tuple[TicketReply, Future[tuple[Appended, ...]]] | None:
+    ) -> tuple[TicketReply, Committed] | None:
         """Answers a ticket request, or None while there is nothing to collect.
 
         The answer may be sent once the future has resolved: then it is in the journal.
@@ -130,16 +125,16 @@ class Owner:
             StorageError: The run cannot go on.
         """
         with self.changed:
-            self._require_sound()
+            self._record.require_sound()
             if (farewell := self._farewell(request.actor)) is not None:
-                return self._reply(request, farewell), _nothing_to_commit()
+                return self._reply(request, farewell), nothing_to_commit()
             if (repeated := self._book.repeated(request)) is not None:
                 self._book.heard(request.actor, request.incarnation, now_secs)
-                return self._reply(request, Instruction.COLLECT, repeated), _nothing_to_commit()
+                return self._reply(request, Instruction.COLLECT, repeated), nothing_to_commit()
             if self._steering.is_paused:
                 return None
             ticket, events = self._book.issue(request, self._latest_version, now_secs)
-            future = self._append_events(events)
+            future = self._record.append_events(events)
             if ticket is None:
                 return None
             return self._reply(request, Instruction.COLLECT, ticket), future
@@ -159,7 +154,7 @@ class Owner:
     def has_news_for(self, actor: str) -> bool:
         """Whether a request of an actor that was not answered before would be now."""
         with self.changed:
-            if self._failure is not None or self._farewell(actor) is not None:
+            if self._record.has_failed or self._farewell(actor) is not None:
                 return True
             return not self._steering.is_paused and self._book.may_issue(self._latest_version)
 
@@ -171,9 +166,9 @@ class Owner:
     def expire_leases(self, now_secs: float) -> None:
         """Gives up what silent actors were collecting, so that others collect it again."""
         with self.changed:
-            self._require_sound()
+            self._record.require_sound()
             if events := self._book.expire(now_secs):
-                self._append_events(events)
+                self._record.append_events(events)
                 self.note_change()
 
     # Trajectories -----------------------------------------------------------------------------
@@ -191,7 +186,7 @@ class Owner:
         trajectory.check_fits(self.preset.network)
         self._journal.wait_for_room()
         with self.changed:
-            self._require_sound()
+            self._record.require_sound()
             self._require_going_on()
             known = self._arrivals.verdict(trajectory.id)
             events = [] if known else self._book.close(trajectory)
@@ -200,10 +195,10 @@ class Owner:
                 self._arrivals.arrived(trajectory.id, verdict)
             if verdict is Verdict.ACCEPTED and not known:
                 self._received.put(trajectory)
-            appended = self._append_events(events, (trajectory_name(trajectory.id), payload))
+            appended = self._record.append_events(events, (trajectory_name(trajectory.id), payload))
         ack: Future[Ack] = Future()
 
-        def acknowledge(done: Future[tuple[Appended, ...]]) -> None:
+        def acknowledge(done: Committed) -> None:
             if (error := done.exception()) is not None:
                 ack.set_exception(error)
                 return
@@ -258,9 +253,10 @@ class Owner:
         """
         with self.changed:
             self.changed.wait_for(
-                lambda: self.is_ready(index) or self.is_stopping or self._failure, timeout_secs
+                lambda: self.is_ready(index) or self.is_stopping or self._record.has_failed,
+                timeout_secs,
             )
-            self._require_sound()
+            self._record.require_sound()
             return self.is_ready(index)
 
     def trajectories(self, index: int) -> list[Trajectory]:
@@ -278,33 +274,10 @@ class Owner:
             raise StorageError(f"journal: expected trajectory {id_}; it is not there")
         return decode(entry.payload, Trajectory)
 
-    def demonstrations(self) -> list[Trajectory]:
-        """What was given to `keep_demonstrations`, in any epoch."""
-        entries = self._journal.entries(prefix="demonstration/")
-        return [decode(entry.payload, Trajectory) for entry in entries]
-
-    def keep_demonstrations(self, demonstrations: Sequence[Trajectory]) -> None:
-        """Makes the demonstrations part of the run's record.
-
-        Raises:
-            MessageError: The preset's network cannot learn from one of them.
-            StorageError: The run has others already.
-        """
-        for item in demonstrations:
-            item.check_fits(self.preset.network)
-        kept = [item.id for item in self.demonstrations()]
-        if kept and kept != [item.id for item in demonstrations]:
-            raise StorageError(
-                f"demonstrations: expected the {len(kept)} that run {self.run} began with; got "
-                "others; leave --demonstrations out, or begin a new run"
-            )
-        named = [(f"demonstration/{n:06d}", item) for n, item in enumerate(demonstrations)]
-        self._append(*named).result()
-
     def policy_ready(self, snapshot: SnapshotTaken) -> None:
         """Journals a policy version; from then on tickets may name it."""
         name = f"snapshot/{snapshot.version}/{snapshot.digest[:16]}"
-        (appended,) = self._append((name, snapshot)).result()
+        (appended,) = self._record.append((name, snapshot)).result()
         self.followers.snapshot_taken(snapshot, appended.offset)
         with self.changed:
             self._latest_version = snapshot.version
@@ -312,10 +285,38 @@ class Owner:
 
     def iteration_ended(self, iteration: IterationEnded) -> None:
         """Journals the end of an iteration; its tickets need not be asked for again."""
-        self._append((f"iteration/{iteration.iteration}", iteration)).result()
+        self._record.append((f"iteration/{iteration.iteration}", iteration)).result()
         per_iteration = self.preset.schedule.episodes_per_iteration
         with self.changed:
             self._book.forget_before((iteration.iteration + 1) * per_iteration)
+
+    # Rewards ----------------------------------------------------------------------------------
+
+    def receive_rewards(self, rewards: Rewards, payload: bytes) -> Future[RewardsAck]:
+        """Takes an iteration's rewards; see `RewardDesk.receive`.
+
+        Raises:
+            MessageError: They are of an iteration or a D_G that was not announced, or too few.
+            StorageError: The run cannot go on, or is over.
+        """
+        with self.changed:
+            self._record.require_sound()
+            self._require_going_on()
+            return self.reward_desk.receive(rewards, payload)
+
+    def wait_rewards(self, announced: IterationAnnounced, timeout_secs: float) -> Rewards | None:
+        """An announced iteration's rewards; None if something else happened, or nothing in time.
+
+        Raises:
+            StorageError: The journal could not be written; the run cannot go on.
+        """
+        with self.changed:
+            self._record.require_sound()
+            seen = self.changes
+        if (given := self.reward_desk.rewards_of(announced)) is None:
+            with self.changed:
+                self.changed.wait_for(lambda: self.changes != seen, timeout_secs)
+        return given
 
     # Followers --------------------------------------------------------------------------------
 
@@ -325,9 +326,11 @@ class Owner:
         Raises:
             StorageError: The journal cannot be read or written.
         """
-        if not self.followers.is_known(request.id):
+        keeps_a_copy = request.role != "discriminator"  # which only reads, and needs no policies
+        if keeps_a_copy and not self.followers.is_known(request.id):
             self._join(FollowerJoined(request.role, request.id))
-        self.followers.heard(request, now_secs)
+        if keeps_a_copy:
+            self.followers.heard(request, now_secs)
         # First what is final, then how far it goes: an entry in between shows in the end offset.
         is_over = self._is_over
         end_offset = self._journal.end_offset
@@ -336,9 +339,11 @@ class Owner:
 
     def _join(self, joined: FollowerJoined) -> None:
         with self.changed:
-            self._require_sound()
+            self._record.require_sound()
             self._joins += 1
-            future = self._append((f"follower/{joined.id}/{self.epoch}/{self._joins}", joined))
+            future = self._record.append(
+                (f"follower/{joined.id}/{self.epoch}/{self._joins}", joined)
+            )
         future.result()
         self.followers.apply(joined)
 
@@ -354,8 +359,8 @@ class Owner:
     def _require_going_on(self) -> None:
         if self._is_over:
             raise StorageError(
-                f"run {self.run}: expected a run that goes on; got one that is over; the "
-                "trajectory stays in the actor's spool, for when the run is resumed"
+                f"run {self.run}: expected a run that goes on; got one that is over; what was sent "
+                "is sent again, or made again, when the run is resumed"
             )
 
     # Control ----------------------------------------------------------------------------------
@@ -368,11 +373,11 @@ class Owner:
             actors: Who is there, for a `drain` that names nobody.
         """
         with self.changed:
-            self._require_sound()
+            self._record.require_sound()
             orders = spelled_out(control, actors)
             first = self._controls + 1
             self._controls += len(orders)
-            future = self._append(
+            future = self._record.append(
                 *((f"control/{self.epoch}/{n}", order) for n, order in enumerate(orders, first))
             )
             for order in orders:
@@ -395,55 +400,14 @@ class Owner:
 
     # The journal ------------------------------------------------------------------------------
 
-    def _append_events(
-        self, events: Sequence[TicketEvent], *first: tuple[str, object]
-    ) -> Future[tuple[Appended, ...]]:
-        for event in events:
-            self._note_trouble(event)
-        return self._append(*first, *map(_named, events))
-
-    def _append(self, *entries: tuple[str, object]) -> Future[tuple[Appended, ...]]:
-        if not entries:
-            return _nothing_to_commit()
-        future = self._journal.append(
-            [(name, item if isinstance(item, bytes) else encode(item)) for name, item in entries]
-        )
-        future.add_done_callback(self._note_append_failure)
-        return future
-
-    def _note_append_failure(self, done: Future[tuple[Appended, ...]]) -> None:
-        if (error := done.exception()) is not None:
-            self.fail(error)
-
-    def _note_trouble(self, event: TicketEvent) -> None:
-        """Says what went wrong; a ticket that no seed solves ends the run."""
-        if isinstance(event, AttemptEnded) and event.reason:
-            self.attempts[event.verdict] += 1
-            _log.warning("Ticket %d: %s, %s", event.ticket, event.verdict.value, event.reason)
-        if isinstance(event, TicketReseeded) and event.generation >= MOST_GENERATIONS:
-            self.fail(
-                StorageError(
-                    f"ticket {event.ticket}: expected a sound attempt with one of "
-                    f"{MOST_GENERATIONS} seeds; got none; see the learner's log for the reasons, "
-                    "and mend the task or the simulator"
-                )
-            )
-
     def fail(self, error: BaseException) -> None:
         """Ends the run with an error, from any thread: nothing more is issued or acked."""
-        _log.error("The run cannot go on: %s", error)
-        with self.changed:
-            self._failure = error if isinstance(error, ClothbusError) else StorageError(str(error))
-            self.note_change()
-
-    def _require_sound(self) -> None:
-        if self._failure is not None:
-            raise self._failure
+        self._record.fail(error)
 
     def _replay(self) -> int:
         """Rebuilds the book; returns the last epoch."""
         epoch = 0
-        for entry in self._journal.entries(without_prefix="trajectory/"):
+        for entry in self._journal.entries(without=_LARGE):
             match decode_any(entry.payload):
                 case RunStarted() as started:
                     epoch = started.owner_epoch
@@ -470,21 +434,3 @@ class Owner:
 
 def _verdict_in(events: Sequence[TicketEvent]) -> Verdict:
     return next(event.verdict for event in events if isinstance(event, AttemptEnded))
-
-
-def _named(event: TicketEvent) -> tuple[str, TicketEvent]:
-    match event:
-        case TicketIssued(ticket=ticket):
-            return f"ticket/{ticket.index}/{ticket.attempt}", event
-        case AttemptEnded(trajectory=None):
-            return f"lost/{event.ticket}/{event.attempt}", event
-        case AttemptEnded():
-            return f"ended/{event.trajectory}", event
-        case TicketReseeded():
-            return f"reseeded/{event.ticket}/{event.generation}", event
-
-
-def _nothing_to_commit() -> Future[tuple[Appended, ...]]:
-    future: Future[tuple[Appended, ...]] = Future()
-    future.set_result(())
-    return future

@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from contextlib import ExitStack
 
 from broker_config.bus import Bus, Publisher
-from broker_config.errors import AlreadyOwned, BusError
+from broker_config.errors import AlreadyOwned, BusError, MessageError
 from broker_config.failpoints import Failpoint, reach
 from broker_config.heart import HUNG_SECS, Heart, Pulse
 from broker_config.journal import Journal
@@ -21,18 +21,22 @@ from broker_config.messages import (
     JournalRequest,
     Metrics,
     Refusal,
+    Rewards,
+    RewardsAck,
     Role,
     Snapshot,
     SnapshotRequest,
     TicketRequest,
     Trajectory,
     Verdict,
+    Welcome,
     weights_digest,
 )
 from broker_config.queries import Responder
-from learner.learning import LearningLoop, PolicyReady
+from learner.learning import LearningEvent, LearningLoop, PolicyReady, RewardsAwaited
 from learner.metrics import LearningMetrics
 from learner.owner import Owner
+from learner.roll_call import RollCall
 from learner.snapshots import SnapshotStore
 from learner.ticket_desk import TicketDesk
 
@@ -40,9 +44,6 @@ _log = logging.getLogger(__name__)
 
 FAREWELL_SECS = 10.0
 """How long a finished learner stays to tell its actors that the run is over."""
-
-SILENCE_SECS = 1.5
-"""Three heartbeats: a process that was not heard of for so long has left its name."""
 
 FOLLOWER_SECS = 15.0
 """How long a finished learner waits for a word of a follower that lacks something."""
@@ -97,8 +98,9 @@ class LearnerService:
         self._hung_secs = hung_secs
         self._keys = bus.keys
         self._state = "starting"
-        self._heard: dict[str, tuple[str, float]] = {}
-        """Incarnation of each actor, and when it was last heard of."""
+        self._awaited: RewardsAwaited | None = None
+        """What keeps the loop waiting for discriminators."""
+        self._roll_call = RollCall()
 
     def run(self) -> None:
         """Learns until the end of the run; everything on the bus closes with it."""
@@ -114,29 +116,47 @@ class LearnerService:
                     "owner",
                     self._name,
                     incarnation,
-                    lambda: (self._state, self._numbers()),
+                    lambda: (self._described_state(), self._numbers()),
                     self._pulse,
                 )
             )
             policies = self._bus.latest_publisher(self._keys.policy)
             metrics = self._bus.publisher(self._keys.metrics("owner", self._name))
             self._learn(policies, metrics, incarnation)
-            self._state = "finished"
-            self._wait_for_farewells()
-            self._wait_for_followers(self._owner.close_record())
+            self._state, self._awaited = "finished", None
+            self._wait_for_farewells("actor")
+            end_offset = self._owner.close_record()
+            self._wait_for_farewells("discriminator")
+            self._wait_for_followers(end_offset)
 
     def _learn(self, policies: Publisher, metrics: Publisher, incarnation: str) -> None:
         self._state = "waiting for actors"
         for sequence, event in enumerate(self._loop):
             self._pulse.beat()
+            self._note(event)
             if isinstance(event, PolicyReady):
                 policies.put(event.snapshot)
                 reach(Failpoint.SNAPSHOT_PUBLISHED)
-            else:
-                self._state = "learning"
             self._metrics.note(event)
             step, numbers = self._metrics.step, self._numbers()
             metrics.put(Metrics("owner", self._name, incarnation, sequence, step, numbers))
+
+    def _note(self, event: LearningEvent) -> None:
+        if not isinstance(event, PolicyReady):
+            self._state = "learning"
+        self._awaited = event if isinstance(event, RewardsAwaited) else None
+        if self._awaited is not None:
+            _log.info("%s", self._described_state())
+
+    def _described_state(self) -> str:
+        """What keeps the run, for a person; any thread."""
+        if (awaited := self._awaited) is None:
+            return self._state
+        state = f"waiting for rewards of iteration {awaited.iteration}"
+        if self._roll_call.has_living("discriminator", time.monotonic()):
+            return state
+        run = self._bus.keys.run
+        return f"{state}: nobody gives any, start `clothbus discriminator --run {run}`"
 
     def _numbers(self) -> dict[str, float]:
         attempts = self._owner.attempts
@@ -144,11 +164,11 @@ class LearnerService:
         state = {"paused": float(self._owner.is_paused)}
         return self._metrics.numbers | wrong | state
 
-    def _wait_for_farewells(self) -> None:
-        """Stays until every actor has heard that it may leave."""
+    def _wait_for_farewells(self, role: Role) -> None:
+        """Stays until every process of a role has heard that it may leave."""
         deadline_secs = time.monotonic() + FAREWELL_SECS
         try:
-            while time.monotonic() < deadline_secs and self._alive("actor"):
+            while time.monotonic() < deadline_secs and self._alive(role):
                 self._pulse.beat()
                 time.sleep(POLL_SECS)
         except BusError as error:
@@ -192,6 +212,7 @@ class LearnerService:
         bulk.serve(keys.every(Kind.POLICY_VERSION), SnapshotRequest, self._on_snapshot_request)
         bulk.serve(keys.every(Kind.JOURNAL), JournalRequest, self._on_journal_request)
         bus.serve(keys.control, Control, self._on_control)
+        bus.serve(keys.every(Kind.REWARDS), Rewards, self._on_rewards)
 
         bus.serve(
             keys.every(Kind.TICKET),
@@ -200,27 +221,18 @@ class LearnerService:
         )
 
     def _on_heartbeat(self, _: ParsedKey, heartbeat: Heartbeat) -> None:
-        if heartbeat.role == "actor":
-            now_secs = time.monotonic()
-            self._heard[heartbeat.id] = heartbeat.incarnation, now_secs
-            if heartbeat.stalled_secs > self._hung_secs:
-                return  # its tickets go to others
+        now_secs = time.monotonic()
+        self._roll_call.heard(heartbeat, now_secs)
+        hangs = heartbeat.stalled_secs > self._hung_secs  # its tickets go to others
+        if heartbeat.role == "actor" and not hangs:
             self._owner.heard(heartbeat.id, heartbeat.incarnation, now_secs)
 
     def _on_attach(self, _: ParsedKey, request: Attach, to: Responder) -> None:
-        living, heard_secs = self._heard.get(request.id, (request.incarnation, 0.0))
-        is_fresh = time.monotonic() - heard_secs < SILENCE_SECS
-        if request.role == "actor" and living != request.incarnation and is_fresh:
-            to.reply(
-                Refusal(
-                    "actor name",
-                    "a name that no living actor has",
-                    f"{request.id}, which acts as incarnation {living}",
-                    "choose another --id, or end the other process first",
-                )
-            )
-            return
-        to.reply(self._owner.attach(request))
+        now_secs = time.monotonic()
+        answer = self._roll_call.refusal(request, now_secs) or self._owner.attach(request)
+        if isinstance(answer, Welcome):
+            self._roll_call.joined(request, now_secs)
+        to.reply(answer)
 
     def _on_trajectory(self, _: ParsedKey, trajectory: Trajectory, to: Responder) -> None:
         def answer(ack: Future[Ack]) -> None:
@@ -255,4 +267,18 @@ class LearnerService:
         to.reply(self._owner.follow(request, MAX_BATCH_BYTES, time.monotonic()))
 
     def _on_control(self, _: ParsedKey, control: Control, to: Responder) -> None:
-        to.reply(self._owner.control(control, list(self._heard)))
+        to.reply(self._owner.control(control, self._roll_call.names("actor")))
+
+    def _on_rewards(self, _: ParsedKey, rewards: Rewards, to: Responder) -> None:
+        def answer(ack: Future[RewardsAck]) -> None:
+            error = ack.exception()
+            if isinstance(error, MessageError):
+                to.refuse(error)
+            elif isinstance(error, Exception):
+                to.fail(error)
+            else:
+                reach(Failpoint.REWARDS_JOURNALED)
+                to.reply(ack.result())
+
+        reach(Failpoint.REWARDS_RECEIVED)
+        self._owner.receive_rewards(rewards, to.question).add_done_callback(answer)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,16 +25,18 @@ from broker_config.errors import MessageError, StorageError
 from broker_config.preset import Preset
 from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.assessment import Assessment, assess, double_q_signals
-from learner.compute import ON_CPU, Compute, TrainingPath
-from learner.cuda_graph import GraphedSteps, exact_float32
-from learner.gradient_steps import EagerSteps, GradientSteps
 from learner.memory import LocalMemory
-from learner.optimiser import FusedAdam, build_optimiser, named_state, overwrite
-from learner.product_steps import ProductSteps
+from learner.minibatches import balanced, shuffled
+from learner.steps.compute import ON_CPU, Compute, TrainingPath
+from learner.steps.eager_steps import EagerSteps, GradientSteps
+from learner.steps.graphed_steps import GraphedSteps, exact_float32
+from learner.steps.optimiser import FusedAdam, build_optimiser, named_state, overwrite
+from learner.steps.patch_convolutions import PatchConvolutions
+from learner.steps.product_steps import EVALUATED_AT_ONCE, ProductSteps
 from learner.teaching_signal import bellman_error
 
-_EVALUATED_AT_ONCE = 128
-"""Pictures for which preferences are computed at a time."""
+_EVALUATED_AT_ONCE = 2 * EVALUATED_AT_ONCE
+"""Pictures for which preferences are computed at a time; a multiple of what steps take at once."""
 _STEPS_AT_ONCE = 256
 """Gradient steps between two calls of `on_step`."""
 
@@ -99,19 +102,19 @@ class Trainer:
         """
         self._preset = preset
         self._on_step = on_step
-        algorithm, schedule = preset.algorithm, preset.schedule
+        algorithm = preset.algorithm
         self._network = build_network(
             preset.network,
             stream_seed(preset.seed, WEIGHTS_STREAM),
             starts_at_zero_value=not algorithm.is_epsilon_greedy,
         ).to(compute.device)
         self._optimiser = build_optimiser(preset.optimiser, self._network)
-        self._memory = LocalMemory(
-            schedule.memory_samples, preset.task.observation_shape, compute.device
-        )
+        self._memory = LocalMemory(_capacity(preset), preset.task.observation_shape, compute.device)
         self._shuffling = torch.Generator().manual_seed(stream_seed(preset.seed, SHUFFLING_STREAM))
         self._counters = _Counters()
-        self._steps = _make_steps(compute.chosen_path, self._network, self._optimiser, self._memory)
+        self._steps, self._evaluate = _make_steps(
+            compute.chosen_path, self._network, self._optimiser, self._memory
+        )
 
     @property
     def memory(self) -> LocalMemory:
@@ -159,7 +162,8 @@ class Trainer:
         A sub-problem is U epochs over shuffled minibatches. A memory of n samples has
         floor(n / minibatch) of them in an epoch, as B = E / minibatch in algorithm 1 (450 / 32 is
         14); the samples left over are others in each epoch. A memory that is smaller than a
-        minibatch is one smaller minibatch.
+        minibatch is one smaller minibatch. Where the memory holds some samples for good, they are
+        one half of each minibatch: see `balanced`.
 
         Source: algorithm 1.
 
@@ -172,7 +176,7 @@ class Trainer:
         N = self._preset.schedule.target_switches if target_switches is None else target_switches
         if N < 1:
             raise MessageError(f"target_switches: expected at least 1; got {N}")
-        if len(self._memory) == 0:
+        if len(self._memory) == self._memory.n_held:
             raise MessageError("memory: expected samples to learn from; got none; add trajectories")
         began_secs = time.perf_counter()
         steps_before = self._counters.gradient_steps
@@ -263,19 +267,20 @@ class Trainer:
         return torch.cat(losses).mean()
 
     def _run_epochs(self, n_epochs: int, teaching_signals: Tensor) -> Tensor:
-        n_samples = len(self._memory)
-        batch_size = min(self._preset.schedule.minibatch_size, n_samples)
-        n_batches = n_samples // batch_size
-        orders = [
-            torch.randperm(n_samples, generator=self._shuffling)[: n_batches * batch_size]
-            for _ in range(n_epochs)
-        ]
-        self._counters.gradient_steps += n_epochs * n_batches
+        epochs = torch.cat([self._draw_epoch() for _ in range(n_epochs)])
+        self._counters.gradient_steps += len(epochs)
         losses = []
-        for batches in torch.split(torch.cat(orders).view(-1, batch_size), _STEPS_AT_ONCE):
+        for batches in torch.split(epochs, _STEPS_AT_ONCE):
             losses.append(self._steps.run(batches, teaching_signals))
             self._on_step()
         return torch.cat(losses)
+
+    def _draw_epoch(self) -> Tensor:
+        n_held, n_samples = self._memory.n_held, len(self._memory)
+        batch_size = self._preset.schedule.minibatch_size
+        if n_held:
+            return balanced(n_held, n_samples, batch_size, self._shuffling)
+        return shuffled(n_samples, batch_size, self._shuffling)
 
     @torch.no_grad()
     def _double_q_signals(self, frozen: Tensor) -> Tensor:
@@ -295,7 +300,7 @@ class Trainer:
         """P(s, a) of every picture in the memory, f32[F, A]: each is s of one, s' of another."""
         with self._numerics():
             parts = [
-                self._network(self._memory.live_frames(start, start + _EVALUATED_AT_ONCE))
+                self._evaluate(self._memory.live_frames(start, start + _EVALUATED_AT_ONCE))
                 for start in range(0, self._memory.n_frames, _EVALUATED_AT_ONCE)
             ]
         return torch.cat(parts)
@@ -313,12 +318,31 @@ class Trainer:
         return exploration.epsilon((self._counters.updates + 1) * per_update)
 
 
+def _capacity(preset: Preset) -> int:
+    """Samples that the memory has room for: those of D, beside what SQIL keeps for good."""
+    kept = 0
+    if preset.algorithm.method == "sqil":
+        assert preset.imitation is not None  # or the preset would have been refused
+        kept = preset.imitation.demonstration_samples
+    return kept + preset.schedule.memory_samples
+
+
 def _make_steps(
     path: TrainingPath, network: PreferenceNetwork, optimiser: FusedAdam, memory: LocalMemory
-) -> GradientSteps:
-    if path == "graphs":
-        return GraphedSteps(network, optimiser, memory)
-    if path == "reference":
-        return EagerSteps(network, optimiser, memory)
-    dtype = torch.bfloat16 if path == "products-bf16" else torch.float32
-    return ProductSteps(network, optimiser, memory, dtype)
+) -> tuple[GradientSteps, Callable[[Tensor], Tensor]]:
+    """What makes gradient steps, and what computes P(s, a) of pictures."""
+    match path:
+        case "graphs":
+            return GraphedSteps(network, optimiser, memory), network
+        case "reference":
+            return EagerSteps(network, optimiser, memory), network
+        case "products-bf16":
+            convolutions = partial(PatchConvolutions, dtype=torch.bfloat16)
+            # Teaching signals are float32, and so is all that they are computed from.
+            return ProductSteps(network, optimiser, memory, convolutions), network
+        case "winograd":
+            # Not above: it imports numba, for which processes that make no steps need not wait.
+            from learner.steps.winograd import WinogradConvolutions
+
+            steps = ProductSteps(network, optimiser, memory, WinogradConvolutions)
+            return steps, steps.evaluate

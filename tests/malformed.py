@@ -24,9 +24,12 @@ from broker_config.messages import (
     Attach,
     Command,
     Control,
+    DiscriminatorSnapshot,
     Heartbeat,
     JournalRequest,
     Metrics,
+    Rewards,
+    Role,
     Snapshot,
     SnapshotRequest,
     Ticket,
@@ -68,25 +71,45 @@ VALID: dict[Kind, object] = {
     Kind.VIEW: View(FORGER, LIFE, 0, 0, 0, 0, 1, 2, 0.5, b"picture", "png", 1.5),
     Kind.LIVE: Heartbeat("actor", FORGER, LIFE, "host", 1, "well", 0.0, {"spooled": 1.0}),
     Kind.CONTROL: Control(Command.PAUSE),
+    Kind.REWARDS: Rewards(
+        discriminator=FORGER,
+        incarnation=LIFE,
+        iteration=0,
+        digest=weights_digest(b"of D_G"),
+        rewards=np.zeros(2, np.float32),
+        expert_version=1,
+        target_version=2,
+        state=b"state",
+        state_digest=weights_digest(b"state"),
+        numbers={"expert_loss": 1.0},
+    ),
+    Kind.DISCRIMINATORS: DiscriminatorSnapshot(
+        FORGER, 0, 1, 2, b"weights", weights_digest(b"weights")
+    ),
 }
 """A message for each kind of key that would be taken."""
 
 _WITHOUT_RANGE = {"schema_version", "pid", "action", "max_bytes", "owner_epoch"}
-_WITH_DEFAULT = {"process", "gives_back"}
+_WITH_DEFAULT = {"process", "gives_back", "marks", "motion"}
 
 ROWS = {row.kind: row for row in CONTRACT}
 
 
 def forged_key(run: str, kind: Kind) -> str:
     """The key of a kind under which the forger may speak."""
-    return str(ParsedKey(run, kind, "actor", FORGER, 0))
+    return str(_parsed(run, kind))
+
+
+def _parsed(run: str, kind: Kind) -> ParsedKey:
+    role: Role = "discriminator" if kind is Kind.REWARDS else "actor"
+    return ParsedKey(run, kind, role, FORGER, 0)
 
 
 def is_refused(run: str, kind: Kind, payload: bytes) -> bool:
     """Whether the contract refuses a payload on the forger's key."""
     try:
         message = decode(payload, *ROWS[kind].messages)
-        check_sender(ParsedKey(run, kind, "actor", FORGER, 0), message)
+        check_sender(_parsed(run, kind), message)
     except MessageError:
         return True
     return False
@@ -104,7 +127,7 @@ def hand_made(kind: Kind) -> Iterator[tuple[str, bytes]]:
     whole = encode(message)
     yield from ((f"cut at {n}", whole[:n]) for n in (1, 2, len(whole) // 2, len(whole) - 1))
     yield "with more behind it", whole + b"\x00"
-    if "role" in plain or "actor" in plain or kind is Kind.TRAJECTORY:
+    if "role" in plain or "actor" in plain or kind in (Kind.TRAJECTORY, Kind.REWARDS):
         yield "of another sender", _of_another_sender(message)
     if kind is Kind.TRAJECTORY:
         yield from _arrays(name, plain)
@@ -195,6 +218,8 @@ def _of_another_sender(message: object) -> bytes:
             return encode(dataclasses.replace(message, id=TrajectoryId("victim", LIFE, 0)))
         case TicketRequest() | View():
             return encode(dataclasses.replace(message, actor="victim"))
+        case Rewards():
+            return encode(dataclasses.replace(message, discriminator="victim"))
         case _:
             return encode(dataclasses.replace(message, id="victim"))  # type: ignore[type-var]
 

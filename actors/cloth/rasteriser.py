@@ -5,12 +5,15 @@ edge leave no gap between them and share no pixel, and every machine draws the s
 """
 
 from dataclasses import dataclass, fields
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.cloth.camera import Camera
+from actors.compiled import compiler
+
+_compiled: Any = compiler()
 
 SUBPIXELS = 256
 
@@ -173,7 +176,7 @@ def _twice_area(
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
 
 
-@numba.njit(cache=True)
+@_compiled  # type: ignore[untyped-decorator] # numba publishes no types
 def _edge(ax: int, ay: int, bx: int, by: int, x: int, y: int) -> int:
     """Positive where (x, y) lies inside of the edge from a to b of a positive triangle.
 
@@ -184,7 +187,7 @@ def _edge(ax: int, ay: int, bx: int, by: int, x: int, y: int) -> int:
     return value if owned else value - 1
 
 
-@numba.njit(cache=True)
+@_compiled  # type: ignore[untyped-decorator] # numba publishes no types
 def _fill_triangles(
     corners: NDArray[np.int64],
     nearness: NDArray[np.float64],

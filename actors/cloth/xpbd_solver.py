@@ -11,14 +11,15 @@ it computes the same bits.
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from actors.compiled import compiler
 
 GRAVITY_M_PER_S2 = 9.8
 _TINY = 1e-12
 
-_compiled: Any = numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
+_compiled: Any = compiler(error_model="numpy", fastmath={"contract"})
 
 
 class Distances(NamedTuple):

@@ -10,7 +10,7 @@ from actors.cloth.gestures import Gesture
 from actors.cloth.guard import GuardReason
 from actors.envs.robot_film import RobotFilm
 from actors.envs.scene import Scene
-from actors.robot.motion import MotionPlan
+from actors.robot.motion import JointPath, MotionPlan
 from actors.robot.planning import ArmPlanner, Obstacle, UnreachableError
 from actors.robot.stances import Stance
 
@@ -23,6 +23,9 @@ class Arms:
         self.stance = stance
         self.obstacles: tuple[Obstacle | None, ...] = ()
         """Why each action cannot be done, as `look_ahead` last found."""
+
+        self.motion: JointPath | None = None
+        """How the joints moved for the last gesture; None if they did not."""
 
         self.film_every_secs: float | None = None
         """Set it to have each gesture filmed; see `pictures`."""
@@ -49,11 +52,12 @@ class Arms:
         Returns:
             Why it cannot, else why the cloth is not in order afterwards.
         """
-        self._film = None
+        self.draw_back()
         try:
             plan = self._planner.plan(scene.vertices_in_world(), gesture)
         except UnreachableError as error:
             return error.obstacle, None
+        self.motion = plan.joint_path
         return None, self._made(scene, gesture, plan, is_missed)
 
     def pictures(self, scene: Scene, size_px: int) -> list[NDArray[np.uint8]]:
@@ -70,8 +74,8 @@ class Arms:
         ]
 
     def draw_back(self) -> None:
-        """Forget the last gesture: a new episode begins."""
-        self._film = None
+        """Forget the last gesture: another one, or a new episode, begins."""
+        self._film = self.motion = None
 
     def _made(
         self, scene: Scene, gesture: Gesture, plan: MotionPlan, is_missed: bool

@@ -64,10 +64,11 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
     reason. Such a transition must not be learned from. An episode is truncated at the horizon.
 
     `info` holds `success`, `guard` (None or a reason), the task's measures and, after a step, what
-    the action was. With `robot` it also holds `action_mask` (i8[n_actions], 1 where the arms can do
-    it, as `action_space.sample` wants it) and, after a step, `unreachable` (None or an
-    `actors.robot.planning.Obstacle`): then the cloth was left as it is. With `stored_states` a
-    reset's holds `initial_state` and `stored_index`.
+    the action was, also as `marks` in the picture. With `robot` it also holds `action_mask`
+    (i8[n_actions], 1 where the arms can do it, as `action_space.sample` wants it) and, after a
+    step, `unreachable` and `motion`: None and the `JointPath` of the arms, or an
+    `actors.robot.planning.Obstacle` and None; then the cloth was left as it is, and there are no
+    marks. With `stored_states` a reset's holds `initial_state` and `stored_index`.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012
@@ -240,9 +241,12 @@ class ClothTaskEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex], ABC):
             self._is_in_order = False
             truncated, reward = True, 0.0
             measures |= {"success": False}
-        info = measures | planned.info | {"guard": None if reason is None else reason.value}
+        marks = planned.marks if unreachable is None else ()
+        info = measures | planned.info | {"marks": marks}
+        info |= {"guard": None if reason is None else reason.value}
         if self.arms is not None:
             info |= {"unreachable": None if unreachable is None else unreachable.value}
+            info |= {"motion": self.arms.motion}
             info |= self._mask() if reason is None else {}
         return self._scene.picture.copy(), reward, False, truncated, info
 

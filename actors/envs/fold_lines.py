@@ -16,7 +16,7 @@ from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, draw_clo
 from actors.envs.cloth_options import ClothTaskOptions
 from actors.envs.cloth_task import ClothTaskEnv
 from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
-from actors.envs.planned_actions import PlannedAction
+from actors.envs.planned_actions import PlannedAction, planned_fold
 
 
 @dataclass(frozen=True)
@@ -101,11 +101,9 @@ class FoldLinesEnv(ClothTaskEnv):
         )
 
     def _plan(self, action: int) -> PlannedAction:
-        plan = plan_fold(self._scene.mask, self._scene.look.camera, self.task.lines[action])
-        return PlannedAction(
-            fold(self._scene.vertices_in_world(), plan),
-            {"fold_line_m": plan.line_m, "grasps_m": plan.grasps_m, "drops_m": plan.drops_m},
-        )
+        scene = self._scene
+        plan = plan_fold(scene.mask, scene.look.camera, self.task.lines[action])
+        return planned_fold(scene.vertices_in_world(), scene.look.camera, plan)
 
     def _judge(self) -> tuple[float, dict[str, Any]]:
         measures = self._target().measures(self._scene, self.task.thresholds)

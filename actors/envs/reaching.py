@@ -22,6 +22,11 @@ from actors.envs.reaching_picture import Colour, draw_arm
 OBSERVATION_PX = 84
 
 
+def observe_arm(joint_angles_rad: NDArray[np.float64], colour: Colour) -> NDArray[np.uint8]:
+    """What an arm with these angles, f64[n], looks like to its policy, u8[84, 84, 1 or 3]."""
+    return draw_arm(joint_positions_m(joint_angles_rad), OBSERVATION_PX, colour)
+
+
 class ReachingEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex]):
     """The n-DOF reaching task, `clothbus/Reaching-v0`.
 
@@ -114,7 +119,7 @@ class ReachingEnv(gymnasium.Env[NDArray[np.uint8], SupportsIndex]):
         return draw_arm(joint_positions_m(self._joint_angles_rad), self._render_px, "rgb")
 
     def _observation(self) -> NDArray[np.uint8]:
-        return draw_arm(joint_positions_m(self._joint_angles_rad), OBSERVATION_PX, self._colour)
+        return observe_arm(self._joint_angles_rad, self._colour)
 
     def _info(self) -> dict[str, Any]:
         to_target_m = distance_m(end_effector_m(self._joint_angles_rad))

@@ -5,13 +5,13 @@ PyBullet says the same of the robot's URDF, about three hundred times more slowl
 
 from typing import Any, Final
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.compiled import compiler
 from actors.robot.model import ARMS, GRIPPER_LENGTH_M, JOINTS, Arm, arm_joints
 
-compiled: Any = numba.njit(cache=True)
+compiled: Any = compiler()
 
 _LINK_NAMES = [joint.link for joint in JOINTS]
 PARENTS: Final = np.array(

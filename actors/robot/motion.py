@@ -1,6 +1,7 @@
 """How the joints move for a gesture, and what the fingers do meanwhile."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +9,24 @@ from numpy.typing import NDArray
 from actors.cloth.carried import CarriedPaths, interpolated
 from actors.cloth.gestures import Gesture
 from actors.robot.kinematics import fingertips_in_robot
-from actors.robot.model import Arm
+from actors.robot.model import JOINT_NAMES, Arm
 from actors.robot.stances import Stance
 
 SAMPLE_SECS = 0.01
 """How often a carried path says where the fingers are: they move 3 mm meanwhile."""
+
+
+class JointPath(NamedTuple):
+    """How joints move, for people: straight lines between postures."""
+
+    names: tuple[str, ...]
+    """Of J joints."""
+
+    times_secs: NDArray[np.float64]
+    """f64[K], from 0 on, by the robot's own clock."""
+
+    joints_rad: NDArray[np.float64]
+    """f64[K, J]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +63,11 @@ class MotionPlan:
     def opens_secs(self) -> float:
         """When they open."""
         return float(self.times_secs[self.opens_at])
+
+    @property
+    def joint_path(self) -> JointPath:
+        """All of it by joint."""
+        return JointPath(JOINT_NAMES, self.times_secs, self.joints_rad)
 
     def joints_at(self, times_secs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Joint angles f64[N, 15] at times f64[N]."""

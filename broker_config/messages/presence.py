@@ -8,7 +8,7 @@ from typing import Literal
 
 from broker_config.messages.rules import require, require_id
 
-Role = Literal["router", "owner", "actor", "recorder", "evaluator", "observer"]
+Role = Literal["router", "owner", "actor", "discriminator", "recorder", "evaluator", "observer"]
 """`owner` is the process that owns the run's journal: the learner."""
 
 

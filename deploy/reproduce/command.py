@@ -10,16 +10,23 @@ from typing import Annotated
 import tyro
 
 from broker_config.errors import PresetError
-from deploy.reproduce.experiment import AttentionFigure, Experiment, with_changes
+from deploy.reproduce.experiment import (
+    AttentionFigure,
+    Experiment,
+    TransferTable,
+    with_changes,
+)
 from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs
-from learner.compute import Compute, TrainingPath
+from learner.steps.compute import Compute, TrainingPath
 
-CURVES, FIGURE, ATTENTION, PAGE = "curves.jsonl", "curves.png", "attention.png", "README.md"
+CURVES, SCORES, WORLDS = "curves.jsonl", "stored_states.jsonl", "worlds.jsonl"
+FIGURE, ATTENTION, PAGE = "curves.png", "attention.png", "README.md"
 
 
 def reproduce(
     name: Annotated[str, tyro.conf.Positional],
     /,
+    panels: tuple[str, ...] = (),
     conditions: tuple[str, ...] = (),
     seeds: int | None = None,
     iterations: int | None = None,
@@ -35,6 +42,7 @@ def reproduce(
 
     Args:
         name: An experiment; an unknown name lists them.
+        panels: Titles of those to run and draw; all if not given.
         conditions: Names of those to run and draw; all if not given.
         seeds: Of each condition; the experiment's own number if not given.
         iterations: How far runs are followed; they go on when it is more next time.
@@ -52,35 +60,64 @@ def reproduce(
     told = [argument for argument in sys.argv[2:] if argument != "--draw-only"]
     command = shlex.join(["clothbus", "reproduce", *told])
     found = find(name)
-    if isinstance(found, AttentionFigure):
-        given = [seeds, iterations, training_path, *conditions, *settings]
-        if any(each is not None for each in given):
+    if not isinstance(found, Experiment):
+        given = [seeds, iterations, training_path, *panels, *conditions, *settings]
+        is_figure = isinstance(found, AttentionFigure)
+        if any(it is not None for it in given) or device != "cpu" or (is_figure and jobs != 1):
+            taken = "--output and --work" if is_figure else "--output, --work, --jobs, --draw-only"
             raise PresetError(
-                f"{name}: expected only --output and --work; it draws the policies that "
-                f"{found.experiment} has left, as it is in the catalogue; leave the others out"
+                f"{name}: expected only {taken}; it takes the policies that experiments have left, "
+                "as it is in the catalogue; leave the others out"
             )
-        draw_attention_figure(found, work, folder, command)
+        if isinstance(found, AttentionFigure):
+            draw_attention_figure(found, work, folder, command)
+        else:
+            draw_transfer_table(found, work, folder, command, jobs, draw_only=draw_only)
         return
-    experiment = with_changes(found, seeds, settings, conditions)
+    experiment = with_changes(found, seeds, settings, conditions, panels)
     plans, curves = list(experiment.plans()), folder / CURVES
+    # Imported here: an episode is played there, and the command line needs no simulator.
+    from deploy.reproduce.stored_scores import score_last_policies
+
     if draw_only:
         runs = finished_runs(plans, curves, iterations)
     else:
         compute = Compute(device, training_path)
         sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
         runs = finish_runs(plans, curves, work / name, compute, jobs, iterations)
-    draw(experiment, runs, folder, command)
+        score_last_policies(experiment, runs, folder / SCORES, work / name, jobs)
+    draw(experiment, runs, folder, command, work / name)
 
 
-def draw(experiment: Experiment, runs: list[FinishedRun], folder: Path, command: str) -> None:
-    """Draws the figure and writes the page of the runs that are finished."""
+def draw(
+    experiment: Experiment,
+    runs: list[FinishedRun],
+    folder: Path,
+    command: str,
+    work: Path = Path(),
+) -> None:
+    """Draws the figures and writes the page of the runs that are finished, and of their scores.
+
+    Args:
+        experiment: What was compared.
+        runs: That are finished.
+        folder: Of the figures and the page.
+        command: That made all this.
+        work: Where the runs have kept their weights; only maps of rewards need them.
+
+    Raises:
+        StorageError: A figure needs weights that are not there.
+    """
     # Imported here: the runs themselves need no matplotlib.
     from deploy.reproduce.report import draw_figure, sort_runs, write_page
+    from deploy.reproduce.reward_map_section import map_rewards
+    from deploy.reproduce.stored_scores import read_scores
 
     folder.mkdir(parents=True, exist_ok=True)
-    panels = sort_runs(experiment, runs)
+    panels = sort_runs(experiment, runs, read_scores(folder / SCORES))
     draw_figure(folder / FIGURE, experiment, panels)
-    write_page(folder / PAGE, experiment, panels, command, FIGURE)
+    sections = map_rewards(experiment, runs, work, folder) if experiment.has_reward_maps else []
+    write_page(folder / PAGE, experiment, panels, command, FIGURE, sections)
     sys.stderr.write(f"{folder / PAGE}: {len(runs)} runs\n")
 
 
@@ -91,10 +128,35 @@ def draw_attention_figure(figure: AttentionFigure, work: Path, folder: Path, com
         StorageError: It has left none.
     """
     from deploy.attention import draw_attention
-    from deploy.reproduce.attention_figure import attended_rows, write_attention_page
+    from deploy.reproduce.attention_figure import (
+        attended_rows,
+        seeds_with_policies,
+        write_attention_page,
+    )
+    from deploy.reproduce.catalogue import find_experiment
 
     folder.mkdir(parents=True, exist_ok=True)
-    rows = attended_rows(figure, work)
-    draw_attention(folder / ATTENTION, figure.title, rows)
-    write_attention_page(folder / PAGE, figure, command, ATTENTION)
-    sys.stderr.write(f"{folder / PAGE}: {len(rows)} policies\n")
+    experiment = find_experiment(figure.experiment)
+    seeds = {figure.seed, *seeds_with_policies(figure, experiment, work)}
+    rows_of_seeds = {seed: attended_rows(figure, experiment, work, seed) for seed in sorted(seeds)}
+    draw_attention(folder / ATTENTION, figure.title, rows_of_seeds[figure.seed])
+    write_attention_page(folder / PAGE, figure, command, ATTENTION, rows_of_seeds)
+    sys.stderr.write(f"{folder / PAGE}: policies of {len(seeds)} seeds\n")
+
+
+def draw_transfer_table(
+    transfer: TransferTable, work: Path, folder: Path, command: str, jobs: int, *, draw_only: bool
+) -> None:
+    """Tests policies in worlds that they have not learned in, as far as they are there.
+
+    Raises:
+        ClothbusError: A trial has failed.
+        StorageError: There is nothing to show.
+    """
+    from deploy.reproduce.transfer import score_worlds
+    from deploy.reproduce.transfer_page import write_transfer_page
+
+    folder.mkdir(parents=True, exist_ok=True)
+    scores = score_worlds(transfer, folder / WORLDS, work, jobs, draw_only=draw_only)
+    write_transfer_page(folder / PAGE, transfer, command, scores)
+    sys.stderr.write(f"{folder / PAGE}: {len(scores)} scores\n")

@@ -5,21 +5,21 @@ from __future__ import annotations
 import fcntl
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
 
 from broker_config.errors import StorageError
 from broker_config.messages import Trajectory
 from broker_config.preset import ImitationPreset
-from deploy.collect import collect_demonstrations
+from deploy.demonstrators import by_script
+from deploy.make_demonstrations import (
+    LEAST_TARGETS,
+    MOST_DRAWS,
+    make_demonstrations,
+    preset_of_draw,
+)
 from deploy.reproduce.runs import RunPlan
-from discriminator.real_states import real_states
+from discriminator.targets import target_states
 from learner.cloning import cloning_preset
-from learner.recorded import first_samples
-
-LEAST_TARGETS: Final = 3
-"""Demonstrations with fewer are drawn anew, by this rule and never by their returns."""
-MOST_DRAWS: Final = 20
-_SEEDS_OF_A_DRAW = 1_000_003
+from learner.recorded import Demonstrations, first_samples
 
 
 def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
@@ -38,7 +38,7 @@ def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
         return []
     for draw in range(MOST_DRAWS):
         played = _played(plan, work, wanted.demonstration_samples, rate, draw)
-        given = list(first_samples(played, wanted.demonstration_samples))
+        given = list(first_samples(played, wanted.demonstration_samples).trajectories)
         if preset.imitation is None or _has_targets(given, preset.imitation):
             return given
     raise StorageError(
@@ -48,25 +48,24 @@ def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
     )
 
 
-def _played(plan: RunPlan, work: Path, samples: int, rate: float, draw: int) -> list[Trajectory]:
+def _played(plan: RunPlan, work: Path, samples: int, rate: float, draw: int) -> Demonstrations:
     """At least so many samples of the demonstrator; each draw has seeds of its own."""
     # Whatever learns from them has nothing to do with how they are made.
     neutral = replace(
-        cloning_preset(plan.preset),
-        seed=(plan.preset.seed + draw * _SEEDS_OF_A_DRAW) % 2**32,
+        preset_of_draw(cloning_preset(plan.preset), draw),
         exploration=None,
         initialisation=None,
         imitation=None,
     )
-    folder = work / "demonstrations" / f"{neutral.digest[:12]}-{rate:g}"
+    folder = work / "demonstrations" / f"{neutral.digest[:12]}-scripted-{rate:g}"
     folder.parent.mkdir(parents=True, exist_ok=True)
     episodes = -(-samples // plan.preset.task.horizon)
     with folder.with_name(f"{folder.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return list(collect_demonstrations(neutral, folder, episodes, "scripted", rate))
+        return make_demonstrations(neutral, folder, episodes, by_script(neutral, rate))
 
 
 def _has_targets(demonstrations: list[Trajectory], imitation: ImitationPreset) -> bool:
     """Whether they show enough for D_T; asked alike whichever discriminators take part."""
-    targets = real_states(demonstrations, imitation.target_reward)["target"]
-    return len(targets) >= LEAST_TARGETS
+    targets = target_states(demonstrations, imitation.target_reward)
+    return sum(int(each.sum()) for each in targets) >= LEAST_TARGETS

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import load_preset
-from deploy.reproduce.runs import RunKey, RunPlan
-
-Start = Literal["untrained", "initialised", "cloned"]
-"""How a run begins: with the untrained policy, by Algorithm 2 from demonstrations, or by supervised
-learning of demonstrations, which is all that is learned then."""
+from deploy.reproduce.runs import RunKey, RunPlan, Start
 
 Measure = Literal["greedy_returns", "greedy_successes", "relative_bellman_errors"]
 
@@ -40,10 +36,20 @@ class Panel:
     conditions: tuple[Condition, ...]
     """The first is compared with each of the others."""
     seeds: int
-    """Seeds 0, 1, ... are given to every condition."""
+    """How many are given to every condition, the same to each."""
     overrides: tuple[str, ...] = ()
     mistake_rate: float | None = None
     """Of its demonstrations; the experiment's if None."""
+    preset: str | None = None
+    """The experiment's if None."""
+    stored_states: str | None = None
+    """Where last policies are scored, too; see `actors.envs.stored_states.read_stored_states`."""
+    first_seed: int = 0
+
+    @property
+    def seed_numbers(self) -> range:
+        """The seeds themselves."""
+        return range(self.first_seed, self.first_seed + self.seeds)
 
 
 @dataclass(frozen=True)
@@ -60,13 +66,15 @@ class Experiment:
     panels: tuple[Panel, ...]
     overrides: tuple[str, ...] = ()
     measures: tuple[Measure, ...] = ("greedy_returns",)
-    """Each is a row of the figure; areas are taken under the first."""
+    """Each is a row of the figure; areas are taken under the first, which is a greedy one."""
     episodes: int = 1
     """Of the greedy policy after each update; 1 is exact where task and start are deterministic."""
     mistake_rate: float = 0.0
     """Share of the demonstrator's actions that are random."""
     notes: tuple[str, ...] = ()
     """What a reader must know of the settings."""
+    has_reward_maps: bool = False
+    """Whether what its discriminators reward is drawn over all poses of an arm with two joints."""
     changes: tuple[str, ...] = ()
     """Settings that somebody has replaced, whatever the experiment says."""
 
@@ -78,10 +86,14 @@ class Experiment:
         """
         made = (*self.overrides, *panel.overrides, *condition.overrides)
         overrides = (*made, *self.changes, f"seed={seed}")
-        preset = load_preset(self.preset, overrides)
-        if condition.start == "untrained":
+        preset = load_preset(self.preset_name(panel), overrides)
+        if condition.start in ("untrained", "pretrained"):
             return dataclasses.replace(preset, initialisation=None)
         return preset
+
+    def preset_name(self, panel: Panel) -> str:
+        """What a panel's runs begin from."""
+        return self.preset if panel.preset is None else panel.preset
 
     def plan(self, panel: Panel, condition: Condition, seed: int) -> RunPlan:
         """All that determines one run."""
@@ -95,12 +107,19 @@ class Experiment:
         return self.mistake_rate if panel.mistake_rate is None else panel.mistake_rate
 
     def plans(self) -> Iterator[RunPlan]:
-        """All runs, seed by seed: what is finished first can be compared first."""
-        for seed in range(max(panel.seeds for panel in self.panels)):
+        """All runs, seed by seed: what is finished first can be compared first.
+
+        A run that several panels show is made once.
+        """
+        planned = set()
+        for number in range(max(panel.seeds for panel in self.panels)):
             for panel in self.panels:
-                if seed < panel.seeds:
+                if number < panel.seeds:
                     for condition in panel.conditions:
-                        yield self.plan(panel, condition, seed)
+                        plan = self.plan(panel, condition, panel.seed_numbers[number])
+                        if plan.key not in planned:
+                            planned.add(plan.key)
+                            yield plan
 
 
 @dataclass(frozen=True)
@@ -114,8 +133,45 @@ class AttentionFigure:
     experiment: str
     """Whose policies they are."""
     conditions: tuple[str, ...]
+    panels: tuple[str, ...] = ()
+    """Titles of those whose policies are drawn; all if none is named."""
     seed: int = 0
     steps: int = 4
+
+
+@dataclass(frozen=True)
+class World:
+    """Where policies are tested that have learned elsewhere."""
+
+    label: str
+    overrides: tuple[str, ...] = ()
+    """Settings that make it of the world in which they have learned."""
+
+
+@dataclass(frozen=True)
+class KeptPolicies:
+    """Last policies of one panel of an experiment."""
+
+    experiment: str
+    panel: str
+    conditions: tuple[str, ...]
+    """Names."""
+
+
+@dataclass(frozen=True)
+class TransferTable:
+    """How last policies of experiments do in worlds that they have not learned in."""
+
+    name: str
+    title: str
+    source: str
+    published: str
+    policies: tuple[KeptPolicies, ...]
+    worlds: tuple[World, ...]
+    """The first is that in which they have learned."""
+    episodes: int = 10
+    """Greedy ones, of each policy in each world, on seeds that no run learns from."""
+    notes: tuple[str, ...] = ()
 
 
 def with_changes(
@@ -123,24 +179,38 @@ def with_changes(
     seeds: int | None = None,
     overrides: Sequence[str] = (),
     conditions: Sequence[str] = (),
+    panels: Sequence[str] = (),
 ) -> Experiment:
-    """The experiment with fewer or more seeds, other settings, or some of its conditions alone.
+    """The experiment with fewer or more seeds, other settings, or a part of its comparisons alone.
 
     Raises:
-        PresetError: There is no condition of a name.
+        PresetError: There is no condition or no panel of a name, or none of both.
     """
     names = {condition.name for panel in experiment.panels for condition in panel.conditions}
-    if unknown := [name for name in conditions if name not in names]:
-        raise PresetError(
-            f"{experiment.name}: expected conditions of {', '.join(sorted(names))}; got "
-            f"{unknown[0]}; choose among them"
-        )
-    panels = []
+    _require_known(experiment, "conditions", conditions, names)
+    titles = {panel.title for panel in experiment.panels}
+    _require_known(experiment, "panels", panels, titles)
+    kept = []
     for panel in experiment.panels:
         chosen = [it for it in panel.conditions if not conditions or it.name in conditions]
-        if chosen:
+        if chosen and (not panels or panel.title in panels):
             n_seeds = panel.seeds if seeds is None else seeds
-            panels.append(dataclasses.replace(panel, seeds=n_seeds, conditions=tuple(chosen)))
+            kept.append(dataclasses.replace(panel, seeds=n_seeds, conditions=tuple(chosen)))
+    if not kept:
+        raise PresetError(
+            f"{experiment.name}: expected conditions of the panels that are asked for; got none "
+            f"of {', '.join(conditions)} in {', '.join(panels)}; leave one of both out"
+        )
     return dataclasses.replace(
-        experiment, panels=tuple(panels), changes=(*experiment.changes, *overrides)
+        experiment, panels=tuple(kept), changes=(*experiment.changes, *overrides)
     )
+
+
+def _require_known(
+    experiment: Experiment, what: str, asked: Sequence[str], known: Iterable[str]
+) -> None:
+    if unknown := [name for name in asked if name not in known]:
+        raise PresetError(
+            f"{experiment.name}: expected {what} of {', '.join(sorted(known))}; got {unknown[0]}; "
+            "choose among them"
+        )

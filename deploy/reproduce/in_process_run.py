@@ -18,18 +18,22 @@ from actors.rollout import ActingPolicy, collect
 from actors.task import make_task_env
 from broker_config.closing import Closing
 from broker_config.durable import write_durably
-from broker_config.errors import StorageError
+from broker_config.errors import PresetError, StorageError
 from broker_config.messages import Trajectory, TrajectoryId
+from broker_config.preset import DiscriminatorPreset
 from broker_config.structure import from_plain, to_plain
-from deploy.player import GUARDED_ATTEMPTS, Player
+from deploy.played_episodes import sound_episode
+from deploy.player import Player
 from deploy.relabelling import relabel
 from deploy.reproduce.demonstrations import demonstrations_of
-from deploy.reproduce.runs import CurvePoint, RunPlan, checkpoints_folder
+from deploy.reproduce.kept_weights import discriminators_file, policy_file
+from deploy.reproduce.runs import CLONED, CurvePoint, RunPlan, checkpoints_folder
 from discriminator.real_states import real_states
 from discriminator.trainer import Discriminators
 from learner.checkpoint import CheckpointStore
 from learner.cloning import Cloned, clone, cloning_preset
-from learner.compute import ON_CPU, Compute
+from learner.sqil import add_own, hold_demonstrations
+from learner.steps.compute import ON_CPU, Compute
 from learner.tickets import make_ticket
 from learner.trainer import Trainer, TrainerState, UpdateReport
 
@@ -46,6 +50,8 @@ class InProcessRun(Closing):
 
     Attributes:
         points: What was reached so far.
+        compute: On what and by which path it trains: the one it was begun with, where no other was
+            asked for.
     """
 
     def __init__(self, plan: RunPlan, work: Path, compute: Compute = ON_CPU) -> None:
@@ -57,6 +63,7 @@ class InProcessRun(Closing):
             compute: What it is trained on.
 
         Raises:
+            StorageError: It was begun on another device, or by another path than is asked for.
             ValueError: The preset has a policy lag.
         """
         preset = plan.preset
@@ -65,18 +72,19 @@ class InProcessRun(Closing):
                 f"{preset.name}: expected schedule.policy_lag 0; got {preset.schedule.policy_lag}; "
                 "one process collects and trains in turn"
             )
-        self._plan, self._preset, self._work, self._compute = plan, preset, work, compute
+        self._plan, self._preset, self._work = plan, preset, work
         self._env: ClothbusEnv | None = None
         self._player: Player | None = None
-        self._trainer = Trainer(preset, compute)
         self._checkpoints = CheckpointStore(checkpoints_folder(work, plan.key))
+        checkpoint = self._checkpoints.latest()
+        self.compute = self._as_begun(compute, checkpoint.extra["compute"] if checkpoint else None)
+        self._trainer = Trainer(preset, self.compute)
         self._policy: Policy | None = None
         """The current one, once somebody has asked for it."""
         self._cloned: Cloned | None = None
         self._discriminators = self._new_discriminators()
         self.points: list[CurvePoint] = []
-        if (checkpoint := self._checkpoints.latest()) is not None:
-            self._require_same_compute(checkpoint.extra["compute"])
+        if checkpoint is not None:
             self._restore(checkpoint.state)
             self.points = [
                 from_plain(point, CurvePoint, "checkpoint.points")
@@ -109,19 +117,18 @@ class InProcessRun(Closing):
             self.points.append(self._iterate() if self.points else self._begin())
             if self._cloned is None:  # cloning is short, and no trainer's state
                 points = [to_plain(point) for point in self.points]
-                extra = {"points": points, "compute": str(self._compute)}
+                extra = {"points": points, "compute": str(self.compute)}
                 self._checkpoints.save(self._state(), extra)
             yield self.points[-1]
 
-    def _require_same_compute(self, before: str) -> None:
-        if before != str(self._compute):
-            raise StorageError(
-                f"{self._plan.key.name}: expected to go on by {before}, as it was begun; got "
-                f"{self._compute}; choose that, or another --work"
-            )
+    def _as_begun(self, compute: Compute, begun: str | None) -> Compute:
+        try:
+            return compute if begun is None else compute.as_begun(begun)
+        except StorageError as error:
+            raise StorageError(f"{self._plan.key.name}: {error}, or another --work") from error
 
     def _begin(self) -> CurvePoint:
-        """Iteration 0: the untrained, the initialised or the cloned policy."""
+        """Iteration 0: the untrained policy, or what its start has made of it."""
         began_secs = time.perf_counter()
         demonstrations = self._demonstrations
         report: UpdateReport | None = None
@@ -131,9 +138,16 @@ class InProcessRun(Closing):
                 self._add(each)
             report = self._trainer.initialise()
             loss, gradient_steps = report.loss, report.gradient_steps
-        if self._plan.key.start == "cloned":
-            self._cloned = clone(self._preset, demonstrations, self._cloning_epochs())
-            loss, gradient_steps = self._cloned.loss, self._cloned.gradient_steps
+        if self._preset.algorithm.method == "sqil":
+            hold_demonstrations(self._trainer, demonstrations)
+        if self._plan.key.start in (*CLONED, "pretrained"):
+            epochs = self._cloning_epochs()
+            cloned = clone(self._preset, demonstrations, epochs, self._augmentation())
+            loss, gradient_steps = cloned.loss, cloned.gradient_steps
+            if self._plan.key.start == "pretrained":
+                self._go_on_from(cloned)
+            else:
+                self._cloned = cloned
         greedy_return, success = self._score()
         horizon = self._preset.task.horizon
         returns = [each.return_ for each in demonstrations if each.steps == horizon]
@@ -168,6 +182,7 @@ class InProcessRun(Closing):
             if schedule.updates_after(index):
                 if self._discriminators is not None:
                     relabel(self._trainer, self._discriminators)
+                    self._keep_discriminators(n_before + 1)
                 report = self._trainer.update()
                 self._policy = None
                 updated_at.append((index + 1) * self._preset.task.horizon)
@@ -194,18 +209,49 @@ class InProcessRun(Closing):
 
     def _new_discriminators(self) -> Discriminators | None:
         imitation = self._preset.imitation
-        if imitation is None or self._plan.key.start == "cloned":
+        has_none = not self._preset.has_discriminators or self._plan.key.start in CLONED
+        if imitation is None or has_none:
             return None
         real = real_states(self._demonstrations, imitation.target_reward)
         return Discriminators(self._preset, real)
 
+    def _keep_discriminators(self, iteration: int) -> None:
+        """Stores what has labelled the samples: rewards and their maps can be made anew from it."""
+        assert self._discriminators is not None
+        path = discriminators_file(self._work, self._plan, iteration)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, self._discriminators.weights_bytes())
+
     def _cloning_epochs(self) -> int:
-        """As many as the learner's beside it: of its initialisation, or of all that it imitates."""
+        """As many as the learner's beside it: of its initialisation, or of all that it imitates.
+
+        What is trained further gets as many as one of its iterations has.
+        """
         initialisation, imitation = self._preset.initialisation, self._preset.imitation
+        if self._plan.key.start == "pretrained":
+            assert imitation is not None
+            return imitation.generator_epochs
         if initialisation is not None:
             return initialisation.target_switches * self._preset.schedule.epochs
         assert imitation is not None  # or there were no demonstrations
         return imitation.generator_epochs * self._preset.schedule.iterations
+
+    def _augmentation(self) -> DiscriminatorPreset | None:
+        if self._plan.key.start != "cloned-augmented":
+            return None
+        if self._preset.imitation is None:
+            raise PresetError(
+                f"{self._preset.name}: expected an [imitation] table, whose discriminators say how "
+                "pictures are changed; got none; add it, or clone without augmentation"
+            )
+        return self._preset.imitation.discriminator
+
+    def _go_on_from(self, cloned: Cloned) -> None:
+        """Has the learner begin with a cloned policy; its optimiser is new."""
+        state = self._trainer.get_state()
+        weights = {f"network.{name}": part for name, part in cloned.weights.items()}
+        counters = {**state.counters, "gradient_steps": cloned.gradient_steps}
+        self._trainer.set_state(TrainerState({**state.tensors, **weights}, counters))
 
     def _state(self) -> TrainerState:
         state = self._trainer.get_state()
@@ -236,6 +282,9 @@ class InProcessRun(Closing):
         return self._policy
 
     def _add(self, played: Trajectory) -> None:
+        if self._preset.algorithm.method == "sqil":
+            add_own(self._trainer, played)
+            return
         self._trainer.add(
             played.observations, played.actions, played.rewards, terminated=played.terminated
         )
@@ -244,16 +293,13 @@ class InProcessRun(Closing):
         """Plays an episode; one that the guard ends is played again on the next seed."""
         if self._env is None:
             self._env = make_task_env(self._preset.task)
-        id_ = TrajectoryId("in-process", "in-process", index)
-        for generation in range(GUARDED_ATTEMPTS):
+        env, id_ = self._env, TrajectoryId("in-process", "in-process", index)
+
+        def play(generation: int) -> Trajectory:
             ticket = make_ticket(self._preset, index, generation=generation)
-            played = collect(self._env, policy, ticket, id_)
-            if played.guard is None:
-                return played
-        raise StorageError(
-            f"episode {index}: expected a sound attempt with one of {GUARDED_ATTEMPTS} seeds; got "
-            f"{played.guard}; mend the task or the simulator"
-        )
+            return collect(env, policy, ticket, id_)
+
+        return sound_episode(index, play)
 
     def _score(self) -> tuple[float, float]:
         """Mean return and portion of success of the greedy policy, on seeds of evaluation."""
@@ -272,8 +318,3 @@ class InProcessRun(Closing):
 def _finite(value: float | None) -> float | None:
     """A number as files keep it: what has diverged is none."""
     return value if value is not None and math.isfinite(value) else None
-
-
-def policy_file(work: Path, plan: RunPlan) -> Path:
-    """Where a run's last policy is kept."""
-    return work / "policies" / f"{plan.key.name}.safetensors"

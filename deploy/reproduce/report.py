@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import matplotlib as mpl
@@ -11,14 +11,21 @@ import numpy as np
 
 from deploy.presets import load_preset
 from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
-from deploy.reproduce.runs import FinishedRun, RunKey
+from deploy.reproduce.runs import CLONED, FinishedRun, RunKey
 from deploy.reproduce.statistics import (
     PairedDifference,
     area_under_curve,
     bootstrap_band,
-    bootstrap_interval,
     interquartile_mean,
     paired_difference,
+)
+from deploy.reproduce.stored_scores import StoredScore, states_of
+from deploy.reproduce.stored_states_section import stored_states_section
+from deploy.reproduce.tables import (
+    DIFFERENCE_HEADER,
+    difference_row,
+    mean_and_interval,
+    table,
 )
 
 mpl.use("Agg")  # before pyplot: there is no screen
@@ -30,10 +37,13 @@ _AXIS_LABELS: dict[Measure, str] = {
     "greedy_successes": "success at the end",
     "relative_bellman_errors": "Bellman error / std(V)",
 }
+_AREA_OF: dict[Measure, str] = {
+    "greedy_returns": "greedy return",
+    "greedy_successes": "success of the greedy policy",
+}
 _PANEL_INCHES = (5.2, 3.4)
 _LEAST_SEEDS = 3
 """With fewer the page says which is ahead, and draws no conclusion."""
-_ONE_SEED = "needs two seeds"
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,10 @@ class PanelRuns:
     panel: Panel
     runs: dict[str, list[FinishedRun]]
     """By condition, in the order of seeds."""
+    measure: Measure = "greedy_returns"
+    """Under which areas are taken."""
+    scores: dict[str, list[StoredScore]] = field(default_factory=dict)
+    """Of last policies on the panel's stored states, by condition."""
 
     @property
     def subject(self) -> Condition:
@@ -50,9 +64,9 @@ class PanelRuns:
         return self.panel.conditions[0]
 
     def areas(self, condition: Condition) -> dict[int, float]:
-        """Area under the greedy curve, by seed."""
+        """Area under the curve of the measure, by seed."""
         return {
-            run.key.seed: area_under_curve(run.samples, run.greedy_returns)
+            run.key.seed: area_under_curve(run.samples, getattr(run, self.measure))
             for run in self.runs[condition.name]
         }
 
@@ -65,20 +79,29 @@ class PanelRuns:
         return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
 
 
-def sort_runs(experiment: Experiment, runs: Sequence[FinishedRun]) -> list[PanelRuns]:
-    """The finished runs, by panel and condition."""
+def sort_runs(
+    experiment: Experiment, runs: Sequence[FinishedRun], scores: Sequence[StoredScore] = ()
+) -> list[PanelRuns]:
+    """The finished runs and their scores, by panel and condition."""
     by_key: dict[RunKey, FinishedRun] = {run.key: run for run in runs}
     sorted_runs = []
     for panel in experiment.panels:
-        found = {
+        keys = {
             condition.name: [
-                by_key[key]
-                for seed in range(panel.seeds)
-                if (key := experiment.plan(panel, condition, seed).key) in by_key
+                experiment.plan(panel, condition, seed).key for seed in panel.seed_numbers
             ]
             for condition in panel.conditions
         }
-        sorted_runs.append(PanelRuns(panel, found))
+        found = {name: [by_key[key] for key in its if key in by_key] for name, its in keys.items()}
+        scored: dict[str, list[StoredScore]] = {}
+        if panel.stored_states is not None:
+            digest = states_of(panel.stored_states).digest
+            on_these = [score for score in scores if score.states_digest == digest]
+            scored = {
+                name: [score for score in on_these if score.run in its]
+                for name, its in keys.items()
+            }
+        sorted_runs.append(PanelRuns(panel, found, experiment.measures[0], scored))
     return sorted_runs
 
 
@@ -127,7 +150,7 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
         middle = interquartile_mean(curves)
         low, high = bootstrap_band(curves)
         label = f"{condition.label} ({len(runs)})"
-        if condition.start == "cloned":
+        if condition.start in CLONED:
             axes.axhline(middle[0], color=condition.colour, linestyle=":", label=label)
             axes.axhspan(low[0], high[0], color=condition.colour, alpha=0.1)
             continue
@@ -152,9 +175,23 @@ def _curves(runs: Sequence[FinishedRun], measure: Measure) -> tuple[list[int], n
 
 
 def write_page(
-    path: Path, experiment: Experiment, panels: Sequence[PanelRuns], command: str, figure_name: str
+    path: Path,
+    experiment: Experiment,
+    panels: Sequence[PanelRuns],
+    command: str,
+    figure_name: str,
+    sections: Sequence[str] = (),
 ) -> None:
-    """Writes what was published, what came out, and what it was made from, as Markdown."""
+    """Writes what was published, what came out, and what it was made from, as Markdown.
+
+    Args:
+        path: Of the page.
+        experiment: What was compared.
+        panels: Its finished runs.
+        command: That made them.
+        figure_name: Of the figure beside the page.
+        sections: What else came out of the runs.
+    """
     parts = [
         f"# {experiment.title}",
         f"![Curves over samples]({figure_name})",
@@ -169,8 +206,10 @@ def write_page(
             _conclusion(panel_runs),
             _scores_table(experiment, panel_runs),
             _differences_table(panel_runs),
+            stored_states_section(panel_runs.panel, panel_runs.scores),
         ]
     parts += [
+        *sections,
         "## How it was made",
         f"```\n{command}\n```",
         _settings(experiment, panels),
@@ -217,9 +256,9 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
         if not runs:
             continue
         cells = [condition.label, str(len(runs))]
-        cells += _mean_and_interval([run.greedy_returns[-1] for run in runs], "{:.2f}")
+        cells += mean_and_interval([run.greedy_returns[-1] for run in runs], "{:.2f}")
         if looks_at_success:
-            cells += _mean_and_interval([run.greedy_successes[-1] for run in runs], "{:.0%}")
+            cells += mean_and_interval([run.greedy_successes[-1] for run in runs], "{:.0%}")
         minutes = np.mean([sum(it.secs for it in run.points) for run in runs]) / 60
         last = runs[0].points[-1]
         cells += [
@@ -229,50 +268,25 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
             f"{minutes:.1f}",
         ]
         rows.append(cells)
-    return _table(header, rows)
-
-
-def _mean_and_interval(values: Sequence[float], form: str) -> list[str]:
-    if len(values) == 1:
-        return [form.format(values[0]), _ONE_SEED]
-    low, high = bootstrap_interval(np.asarray(values))
-    return [form.format(np.mean(values)), f"{form.format(low)} to {form.format(high)}"]
+    return table(header, rows)
 
 
 def _differences_table(panel_runs: PanelRuns) -> str:
-    header = ["difference of areas", "each seed", "mean", "95 % bootstrap", "95 % Student's t"]
-    rows = []
-    for other in panel_runs.panel.conditions[1:]:
-        difference = panel_runs.difference(other)
-        if difference is None:
-            continue
-        rows.append(
-            [
-                f"{panel_runs.subject.label} - {other.label}",
-                ", ".join(f"{value:+.2f}" for value in difference.differences),
-                f"{difference.mean:+.2f}",
-                _ONE_SEED if difference.t is None else _interval(difference.bootstrap),
-                _ONE_SEED if difference.t is None else _interval(difference.t),
-            ]
-        )
-    return _table(header, rows) if rows else ""
+    rows = [
+        difference_row(f"{panel_runs.subject.label} - {other.label}", difference)
+        for other in panel_runs.panel.conditions[1:]
+        if (difference := panel_runs.difference(other)) is not None
+    ]
+    return table(["difference of areas", *DIFFERENCE_HEADER], rows) if rows else ""
 
 
 def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
-    preset = load_preset(experiment.preset, (*experiment.overrides, *experiment.changes))
-    schedule, optimiser = preset.schedule, preset.optimiser
     runs = [run for each in panels for runs in each.runs.values() for run in runs]
-    followed = max((run.iterations for run in runs), default=0)
-    made_on = " and ".join(sorted({run.compute for run in runs}))
     lines = [
-        f"* Preset `{preset.name}` ({preset.source}), where a condition does not say otherwise: "
-        f"eta {preset.algorithm.eta:g}, gamma {preset.algorithm.gamma:g}, M "
-        f"{schedule.episodes_per_iteration}, T {preset.task.horizon}, E {schedule.memory_samples}, "
-        f"N {schedule.target_switches}, U {schedule.epochs}, minibatches of "
-        f"{schedule.minibatch_size}, an update every {schedule.update_every}, {optimiser.name} "
-        f"{optimiser.learning_rate:g}; {followed} of {schedule.iterations} iterations; {made_on}.",
-        "* The area is the mean greedy return over the samples, by trapezia from the first point "
-        f"to the last. Greedy episodes after each update: {experiment.episodes}.",
+        *_preset_lines(experiment, panels),
+        f"* The area is the mean {_AREA_OF[experiment.measures[0]]} over the samples, by trapezia "
+        "from the first point to the last. Greedy episodes after each update: "
+        f"{experiment.episodes}.",
         "* Seeds are paired: initial weights, minibatches, demonstrations and the episodes' random "
         "numbers are derived from them. All runs are shown.",
         *(f"* {note}" for note in experiment.notes),
@@ -289,10 +303,25 @@ def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
     return "\n".join(lines)
 
 
-def _interval(bounds: tuple[float, float]) -> str:
-    return f"{bounds[0]:+.2f} to {bounds[1]:+.2f}"
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def _preset_lines(experiment: Experiment, panels: Sequence[PanelRuns]) -> list[str]:
+    """What the runs of each preset were made with."""
+    by_name: dict[str, list[FinishedRun]] = {}
+    for each in panels:
+        its = by_name.setdefault(experiment.preset_name(each.panel), [])
+        its += [run for runs in each.runs.values() for run in runs]
+    lines = []
+    for name, runs in by_name.items():
+        preset = load_preset(name, (*experiment.overrides, *experiment.changes))
+        schedule, optimiser = preset.schedule, preset.optimiser
+        followed = max((run.iterations for run in runs), default=0)
+        made_on = " and ".join(sorted({run.compute for run in runs}))
+        lines.append(
+            f"* Preset `{preset.name}` ({preset.source}), where a condition does not say "
+            f"otherwise: eta {preset.algorithm.eta:g}, gamma {preset.algorithm.gamma:g}, M "
+            f"{schedule.episodes_per_iteration}, T {preset.task.horizon}, E "
+            f"{schedule.memory_samples}, N {schedule.target_switches}, U {schedule.epochs}, "
+            f"minibatches of {schedule.minibatch_size}, an update every {schedule.update_every}, "
+            f"{optimiser.name} {optimiser.learning_rate:g}; {followed} of {schedule.iterations} "
+            f"iterations; {made_on}."
+        )
+    return lines

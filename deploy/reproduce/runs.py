@@ -14,16 +14,21 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from broker_config.durable import write_durably
-from broker_config.errors import MessageError, StorageError
 from broker_config.ownership import FileLock
 from broker_config.preset import Preset
-from broker_config.structure import from_plain, to_plain
 from deploy.process import end_with_parent, use_one_torch_thread
-from learner.compute import Compute
+from deploy.reproduce.json_lines import read_lines, write_lines
+from learner.steps.compute import Compute
 
 ON_CLONING: Final = "autograd on cpu"
 """What clones are trained by, whatever learners are."""
+
+Start = Literal["untrained", "initialised", "cloned", "cloned-augmented", "pretrained"]
+"""How a run begins: with the untrained policy, by Algorithm 2 from demonstrations, or by supervised
+learning of demonstrations, of their pictures as they are or changed as discriminators see them. A
+run that is cloned learns nothing more; one that is pretrained imitates from there."""
+
+CLONED: Final[tuple[Start, ...]] = ("cloned", "cloned-augmented")
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class RunKey:
     seed: int
     preset_digest: str
     """Of the run's own preset, condition and seed included."""
-    start: Literal["untrained", "initialised", "cloned"]
+    start: Start
     mistake_rate: float | None
     """Of the demonstrator, where there is one."""
     episodes: int
@@ -137,8 +142,8 @@ def finish_runs(
         ClothbusError: A run has failed; all others were finished before.
         StorageError: The file cannot be read or written.
     """
-    wanted = {plan.key: _iterations_of(plan, iterations) for plan in plans}
-    whole = {plan.key: _iterations_of(plan, None) for plan in plans}
+    wanted = {plan.key: iterations_of(plan, iterations) for plan in plans}
+    whole = {plan.key: iterations_of(plan, None) for plan in plans}
     with FileLock(work / "reproduce.lock", f"experiment in {work}"):
         finished = {run.key: run for run in read_runs(curves)}
         missing = []
@@ -165,7 +170,7 @@ def finished_runs(
 ) -> list[FinishedRun]:
     """Those of the runs that the file holds, as far as `finish_runs` would follow them."""
     finished = {run.key: run for run in read_runs(curves)}
-    wanted = {plan.key: _iterations_of(plan, iterations) for plan in plans}
+    wanted = {plan.key: iterations_of(plan, iterations) for plan in plans}
     return [
         _up_to(finished[key], n)
         for key, n in wanted.items()
@@ -178,8 +183,9 @@ def checkpoints_folder(work: Path, key: RunKey) -> Path:
     return work / "checkpoints" / key.name
 
 
-def _iterations_of(plan: RunPlan, iterations: int | None) -> int:
-    if plan.key.start == "cloned":
+def iterations_of(plan: RunPlan, iterations: int | None) -> int:
+    """How far a run is followed where so many iterations are asked for, or all."""
+    if plan.key.start in CLONED:
         return 0
     planned = plan.preset.schedule.iterations
     return planned if iterations is None else min(planned, iterations)
@@ -228,9 +234,9 @@ def _run(plan: RunPlan, work: Path, compute: Compute, iterations: int) -> Finish
     with InProcessRun(plan, work, compute) as run:
         for point in run.finish(iterations):
             sys.stderr.write(f"{plan.key.name}: {_described(point)}\n")
-        if run.points[-1].iteration >= _iterations_of(plan, None):
+        if run.points[-1].iteration >= iterations_of(plan, None):
             run.keep_policy()
-        made_by = ON_CLONING if plan.key.start == "cloned" else str(compute)
+        made_by = ON_CLONING if plan.key.start in CLONED else str(run.compute)
         return FinishedRun(plan.key, made_by, tuple(run.points))
 
 
@@ -248,16 +254,8 @@ def read_runs(path: Path) -> list[FinishedRun]:
     Raises:
         StorageError: The file holds something else.
     """
-    if not path.exists():
-        return []
     curves: dict[tuple[RunKey, str], list[CurvePoint]] = {}
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        try:
-            row = from_plain(json.loads(line), _Row, f"{path.name}:{number}")
-        except (ValueError, MessageError) as error:
-            raise StorageError(
-                f"{path}: expected learning curves; got line {number}: {error}; move it away"
-            ) from error
+    for row in read_lines(path, _Row, "learning curves"):
         curves.setdefault((row.run, row.compute), []).append(row.point)
     return [FinishedRun(key, compute, tuple(points)) for (key, compute), points in curves.items()]
 
@@ -269,13 +267,7 @@ def write_runs(path: Path, runs: Iterable[FinishedRun]) -> None:
         StorageError: The disk refuses.
     """
     ordered = sorted(runs, key=lambda run: (run.key.condition, run.key.seed, run.key.name))
-    rows = [_Row(run.key, run.compute, point) for run in ordered for point in run.points]
-    text = "".join(json.dumps(to_plain(row)) + "\n" for row in rows)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_durably(path, text.encode())
-    except OSError as error:
-        raise StorageError(f"{path}: expected to write {len(rows)} lines; got {error}") from error
+    write_lines(path, [_Row(it.key, it.compute, point) for it in ordered for point in it.points])
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 _BOOTSTRAP_DRAWS = 100_000
 _BAND_DRAWS = 2_000
 """For each point of a curve: a figure shows no third digit."""
+_HIERARCHICAL_DRAWS = 10_000
 _INTEGRATION_INTERVALS = 4000
 
 
@@ -63,6 +64,36 @@ def paired_difference(
     )
 
 
+def rank_correlation(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Spearman's: the correlation of ranks, where equal values share the mean of theirs.
+
+    Args:
+        first: f64[n], at least 2.
+        second: As many.
+
+    Returns:
+        From -1 to 1; nan where all values of one are equal, which have no order to agree with.
+
+    Raises:
+        ValueError: They are not as many, or fewer than 2.
+    """
+    if first.shape != second.shape or first.ndim != 1 or len(first) < 2:
+        raise ValueError(
+            f"ranks: expected two lines of as many values, at least 2; got {list(first.shape)}, "
+            f"{list(second.shape)}"
+        )
+    ranks = np.stack([_ranks(first), _ranks(second)])
+    deviations = ranks - ranks.mean(axis=1, keepdims=True)
+    squares = float(np.prod((deviations**2).sum(axis=1)))
+    return float(np.prod(deviations, axis=0).sum()) / math.sqrt(squares) if squares else math.nan
+
+
+def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0, in increasing order."""
+    _, kinds, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts + 1) / 2)[kinds], np.float64)
+
+
 def interquartile_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean over the middle half of the seeds; with fewer than four, over all.
 
@@ -85,6 +116,27 @@ def bootstrap_interval(
     """
     generator = np.random.default_rng(0)  # the interval is part of a document: always the same
     means = generator.choice(values, (_BOOTSTRAP_DRAWS, len(values))).mean(1)
+    low, high = _quantiles(means, confidence)
+    return float(low), float(high)
+
+
+def hierarchical_interval(
+    values: NDArray[np.float64], confidence: float = 0.95
+) -> tuple[float, float]:
+    """Percentile interval of the mean where seeds are drawn anew, and trials within each of them.
+
+    Trials of one policy are no replications: what one seed learned, all of its trials share.
+
+    Args:
+        values: f64[seeds, trials].
+        confidence: Portion of the means that lie inside.
+    """
+    n_seeds, n_trials = values.shape
+    generator = np.random.default_rng(0)
+    means = np.empty(_HIERARCHICAL_DRAWS)
+    for draw in range(_HIERARCHICAL_DRAWS):
+        seeds = generator.integers(n_seeds, size=(n_seeds, 1))
+        means[draw] = values[seeds, generator.integers(n_trials, size=(n_seeds, n_trials))].mean()
     low, high = _quantiles(means, confidence)
     return float(low), float(high)
 

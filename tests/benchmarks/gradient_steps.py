@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from broker_config.preset import Preset
 from deploy.presets import load_preset
-from learner.compute import Compute, TrainingPath
+from learner.steps.compute import Compute, TrainingPath
 from learner.trainer import Trainer
 from tests.benchmarks.measuring import RESULTS, keep_result
 

@@ -94,7 +94,7 @@ def measure(rounds: int) -> dict[str, object]:
         metrics = stack.enter_context(LearningMetrics(folder / "tensorboard"))
         owner = Owner("run", preset, journal)
         stores = CheckpointStore(folder / "checkpoints"), SnapshotStore(folder / "snapshots")
-        events = iter(LearningLoop(owner, Trainer(preset, "cpu", lambda: None), *stores))
+        events = iter(LearningLoop(owner, Trainer(preset), *stores))
         next(events)  # the untrained policy
         for number in range(rounds):
             one_round(owner, number, watch)

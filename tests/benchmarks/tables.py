@@ -1,4 +1,4 @@
-"""Draws the tables of docs/delivery.md and docs/cloth.md from the newest results.
+"""Draws the tables of docs/delivery.md, cloth.md, learner.md and recordings.md from results.
 
 python -m tests.benchmarks.tables build/bench/results.jsonl
 """
@@ -216,6 +216,23 @@ def _median(ordered: Sequence[float]) -> float:
     return ordered[len(ordered) // 2]
 
 
+def recording_files(lines: Sequence[Line]) -> str:
+    """Time, rate and memory of each command on a large recording."""
+    it = lines[-1]
+    rows = [
+        [
+            f"`{name.partition(' ')[0]}`{''.join(name.partition(' ')[1:])}",
+            found["secs"], found["cpu_secs"],
+            f"{1e3 * it['size_gb'] / found['secs']:,.0f}" if name != "info" else "",
+            found["peak_mib"], found.get("written_mb", ""),
+        ]
+        for name, found in it["commands"].items()
+    ]  # fmt: skip
+    head = ["command", "s", "s of CPU", "MB of the recording a second", "peak MiB", "MB written"]
+    form = f"{it['size_gb']} GB in {it['segments']} segments of random pictures"
+    return table(head, rows) + made_by(lines, form)
+
+
 PAGES: dict[Path, dict[str, Callable[[Sequence[Line]], str]]] = {
     Path("docs/delivery.md"): {
         "losses": losses,
@@ -230,6 +247,7 @@ PAGES: dict[Path, dict[str, Callable[[Sequence[Line]], str]]] = {
         "engine_comparison": engine_comparison,
     },
     Path("docs/learner.md"): {"gradient_steps": gradient_steps},
+    Path("docs/recordings.md"): {"recording_files": recording_files},
 }
 
 

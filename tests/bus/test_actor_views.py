@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from actors.robot.motion import JointPath
 from actors.rollout import Step
 from actors.views import Views
 from broker_config.keys import Kind
-from broker_config.messages import Ticket, View
+from broker_config.messages import Mark, Ticket, View
 from tests.conftest import until_declared
 
 TICKET = Ticket(3, 1, 0, 7, 5, 200, 0.0)
@@ -72,6 +75,31 @@ def test_a_picture_is_what_was_seen(
     assert shown is not None
     shown = cv2.cvtColor(shown, cv2.COLOR_BGR2RGB) if channels == 3 else shown[..., None]
     assert np.array_equal(shown, seen)
+
+
+@pytest.mark.parametrize("lasted_secs", [1e-4, 1e6])
+def test_a_motion_ends_with_its_picture_and_took_no_longer_than_its_step(
+    attach: Any, wait_until: Callable[..., None], lasted_secs: float
+) -> None:
+    heard = listen(attach)
+    views = Views(attach("actor", "actor-0"), "actor-0", "life")
+    times = np.array([0.0, 0.25, 1.0]) * lasted_secs
+    path = JointPath(("A", "B"), times, np.arange(6.0).reshape(3, 2))
+    began_secs = time.monotonic()
+    views.show_start(TICKET, step(0).observation)
+    wait_until(lambda: heard, "the first picture")
+    moved = replace(step(1), motion=path, marks=(Mark("pick", ((1.0, 2.0),)),))
+    views.show_step(TICKET, 1, moved, is_last=True)
+    took_secs = time.monotonic() - began_secs
+    wait_until(lambda: len(heard) == 2, "the second picture")
+    motion = heard[1].motion
+    assert motion is not None
+    assert (motion.joints, motion.angles_rad.tolist()) == (("A", "B"), path.joints_rad.tolist())
+    first, second, last = motion.secs_before.tolist()
+    assert first <= min(took_secs, lasted_secs) * (1 + 1e-6)
+    assert (second, last) == (pytest.approx(0.75 * first), 0.0)
+    assert lasted_secs > 1 or first == pytest.approx(lasted_secs)
+    assert heard[1].marks == moved.marks
 
 
 def test_what_is_too_large_to_be_shown_does_not_stop_the_actor(

@@ -17,9 +17,11 @@ from broker_config.liveliness import runs_on
 from broker_config.messages import (
     Attach,
     Control,
+    DiscriminatorSnapshot,
     Heartbeat,
     JournalRequest,
     Metrics,
+    Rewards,
     Snapshot,
     SnapshotRequest,
     TicketRequest,
@@ -169,6 +171,7 @@ SERVED = {
     Kind.JOURNAL: JournalRequest,
     Kind.POLICY_VERSION: SnapshotRequest,
     Kind.CONTROL: Control,
+    Kind.REWARDS: Rewards,
 }
 
 
@@ -185,6 +188,8 @@ def keys_of(bus):
         Kind.METRICS: keys.metrics("actor", "a"),
         Kind.LIVE: keys.live("actor", "a"),
         Kind.CONTROL: keys.control,
+        Kind.REWARDS: keys.rewards("discriminator"),
+        Kind.DISCRIMINATORS: keys.discriminators,
     }
 
 
@@ -200,6 +205,7 @@ def test_garbage_on_every_key_is_counted_and_nothing_dies(router, attach, wait_u
     owner.subscribe(owner.keys.every(Kind.LIVE), Heartbeat, never)
     owner.subscribe(owner.keys.every(Kind.VIEW), View, never)
     reader = owner.latest_reader(owner.keys.policy, Snapshot)
+    newest = owner.latest_reader(owner.keys.discriminators, DiscriminatorSnapshot)
     until_declared(owner)
     keys = keys_of(owner)
     assert set(keys) == set(Kind)
@@ -229,6 +235,7 @@ def test_garbage_on_every_key_is_counted_and_nothing_dies(router, attach, wait_u
             "all garbage is counted",
         )
     assert reader.get() is None
+    assert newest.get() is None
     assert_still_works(owner, attach)
 
 

@@ -282,6 +282,7 @@ def test_views_metrics_and_presence_are_recorded_and_dropped_ones_marked(
     assert Presence("owner", "learner", is_alive=True) in present
     topics = {item.topic for item in iter_recording(folder)}
     assert {"metrics/actor/actor-0", "metrics/recorder/recorder", "view/actor-0/image"} <= topics
+    assert {"metrics/actor/actor-0/steps", "metrics/recorder/recorder/behind"} <= topics
 
 
 def test_a_flood_of_views_is_dropped_in_part_and_the_journal_is_whole(

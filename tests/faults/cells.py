@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,6 +17,7 @@ class Role(StrEnum):
     RECORDER = "recorder"
     ROUTER = "router"
     EVALUATOR = "evaluator"
+    DISCRIMINATOR = "discriminator"
 
 
 class Fault(StrEnum):
@@ -51,6 +52,9 @@ ROLE_OF_POINT = {
             Failpoint.ITERATION_JOURNALED,
             Failpoint.SNAPSHOT_JOURNALED,
             Failpoint.SNAPSHOT_PUBLISHED,
+            Failpoint.ITERATION_ANNOUNCED,
+            Failpoint.REWARDS_RECEIVED,
+            Failpoint.REWARDS_JOURNALED,
         ),
         Role.LEARNER,
     ),
@@ -67,6 +71,15 @@ ROLE_OF_POINT = {
         (Failpoint.EVALUATION_PLAYED, Failpoint.EVALUATION_WRITTEN),
         Role.EVALUATOR,
     ),
+    **dict.fromkeys(
+        (
+            Failpoint.ANNOUNCEMENT_FOLLOWED,
+            Failpoint.REWARDS_MADE,
+            Failpoint.REWARDS_ACKED,
+            Failpoint.DISCRIMINATORS_PUBLISHED,
+        ),
+        Role.DISCRIMINATOR,
+    ),
 }
 """Which process is killed at a failpoint.
 
@@ -78,6 +91,12 @@ AT_START = frozenset({Failpoint.RECORDING_RECOVERED})
 """Only a process that has just been killed, and starts again, gets here."""
 
 
+IMITATION_ONLY = frozenset(
+    {Failpoint.ITERATION_ANNOUNCED, Failpoint.REWARDS_RECEIVED, Failpoint.REWARDS_JOURNALED}
+)
+"""The learner's failpoints that only a run with discriminators reaches."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """A column of the matrix: a fault of a role at random moments, or its kill at a failpoint."""
@@ -87,20 +106,21 @@ class Cell:
     failpoint: Failpoint | None = None
 
     @property
+    def is_of_imitation(self) -> bool:
+        return self.role is Role.DISCRIMINATOR or self.failpoint in IMITATION_ONLY
+
+    @property
     def name(self) -> str:
         return f"at {self.failpoint}" if self.failpoint else self.fault.value
 
 
-RANDOM_CELLS = tuple(Cell(role, fault) for role in Role for fault in Fault)
 FAILPOINT_CELLS = tuple(Cell(role, Fault.KILL, point) for point, role in ROLE_OF_POINT.items())
 
 
 def still_to_do(
-    each: int, at_failpoints: int, done: Iterable[Cell], shuffler: random.Random
+    wanted: Mapping[Cell, int], done: Iterable[Cell], shuffler: random.Random
 ) -> list[Cell]:
     """The faults that are missing from so many of each cell, in random order."""
-    wanted = Counter(dict.fromkeys(RANDOM_CELLS, each))
-    wanted += Counter(dict.fromkeys(FAILPOINT_CELLS, at_failpoints))
-    missing = list((wanted - Counter(done)).elements())
+    missing = list((Counter(wanted) - Counter(done)).elements())
     shuffler.shuffle(missing)
     return missing

@@ -19,6 +19,7 @@ from broker_config.failpoints import FAILPOINT_VARIABLE, Failpoint
 from deploy.process import child_environment
 from deploy.run_folder import RunFolder
 from tests.faults.cells import AT_START, STOP_SECS, Cell, Fault, Role
+from tests.faults.scenes import EVALUATION_EPISODES, Scene
 from tests.faults.witness import (
     Child,
     Heartbeats,
@@ -30,23 +31,6 @@ from tests.faults.witness import (
 )
 
 T = TypeVar("T")
-
-ITERATIONS = 100
-EPISODES_PER_ITERATION = 4
-SETTINGS = (
-    "task.options.n_joints=5",
-    "task.n_actions=25",
-    "task.horizon=25",
-    f"schedule.iterations={ITERATIONS}",
-    f"schedule.episodes_per_iteration={EPISODES_PER_ITERATION}",
-    'schedule.update_every="iteration"',
-    "schedule.memory_samples=100",
-    "schedule.target_switches=1",
-    "schedule.epochs=1",
-)
-"""5-DOF reaching. An iteration is an episode of each of four actors and a short update."""
-
-EVALUATION_EPISODES = 2
 
 LAST_FAULT_AT = 0.8
 """No fault begins after this share of the episodes: the run shall not end before it has healed."""
@@ -109,12 +93,8 @@ class Outcome:
     """How often the supervisor found a process hanging, and killed it."""
 
 
-def preset_arguments(seed: int) -> list[str]:
-    """Which run it is; an undisturbed one with the same must come to the same weights."""
-    return ["run", "reaching-smoke", "--set", *SETTINGS, f"seed={seed}"]
-
-
 def disturb(
+    scene: Scene,
     work: Path,
     seed: int,
     actors: int,
@@ -127,7 +107,7 @@ def disturb(
     Raises:
         NotHealed: The run did not go on after a fault, or did not end well.
     """
-    with _started(work, seed, actors) as run:
+    with _started(scene, work, seed, actors) as run:
         run.wait_steady()
         while faults and run.is_young():
             time.sleep(dice.uniform(0.0, LONGEST_PAUSE_SECS))  # the moment is random
@@ -140,7 +120,7 @@ def disturb(
 
 
 @contextlib.contextmanager
-def _started(work: Path, seed: int, actors: int) -> Iterator[_Run]:
+def _started(scene: Scene, work: Path, seed: int, actors: int) -> Iterator[_Run]:
     work.mkdir(parents=True)
     flags = work / "flags"
     flags.mkdir()
@@ -148,10 +128,10 @@ def _started(work: Path, seed: int, actors: int) -> Iterator[_Run]:
     for point in Failpoint:
         (flags / point).touch()  # spent, until a fault takes the flag away
         armed.append(f"{point}:1:{flags / point}")
-    arguments = preset_arguments(seed)
-    arguments[2:2] = ["--runs", str(work / "runs"), "--actors", str(actors)]
-    arguments[2:2] = ["--step-log", str(work / "steps.jsonl")]
-    arguments[2:2] = ["--evaluate", str(EVALUATION_EPISODES), "--evaluator-priority", "normal"]
+    options = ["--runs", str(work / "runs"), "--actors", str(actors)]
+    options += ["--step-log", str(work / "steps.jsonl")]
+    options += ["--evaluate", str(EVALUATION_EPISODES), "--evaluator-priority", "normal"]
+    arguments = scene.run_arguments(work.parent, seed, *options)
     with (work / "run.log").open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "deploy.cli", *arguments],
@@ -166,12 +146,13 @@ def _started(work: Path, seed: int, actors: int) -> Iterator[_Run]:
         address = _wait(lambda: _address(folder), "the router's address", START_SECS)
         bus = stack.enter_context(open_bus(address, folder.run, "observer", "fault-matrix"))
         tail = stack.enter_context(contextlib.closing(JournalTail(folder.journal)))
-        yield _Run(process, folder, work, actors, tail, Heartbeats(bus))
+        yield _Run(scene, process, folder, work, actors, tail, Heartbeats(bus))
 
 
 class _Run:
     def __init__(
         self,
+        scene: Scene,
         process: subprocess.Popen[bytes],
         folder: RunFolder,
         work: Path,
@@ -179,10 +160,11 @@ class _Run:
         tail: JournalTail,
         heartbeats: Heartbeats,
     ) -> None:
+        self._scene = scene
         self._process = process
         self._folder = folder
         self._work = work
-        self._processes = actors + len(Role) - 1
+        self._processes = actors + len(scene.processes) - 1
         self._tail = tail
         self._heartbeats = heartbeats
         self._began_secs = time.monotonic()
@@ -195,8 +177,8 @@ class _Run:
 
     def is_young(self) -> bool:
         self._tail.poll()
-        episodes = ITERATIONS * EPISODES_PER_ITERATION
-        return not self.is_over() and self._tail.trajectories < LAST_FAULT_AT * episodes
+        most = LAST_FAULT_AT * self._scene.episodes
+        return not self.is_over() and self._tail.trajectories < most
 
     def wait_steady(self) -> None:
         """Waits until every process is there and has been heard; the evaluator may be late."""
@@ -335,6 +317,8 @@ class _Run:
                 return self._committed(("trajectory/",), since_secs)
             case Role.RECORDER:
                 return self._caught_up(it)
+            case Role.DISCRIMINATOR:
+                return self._committed(("rewards/",), since_secs)
             case Role.EVALUATOR:
                 has_more = len(whole_lines(self._folder.evaluation)) > it.evaluated
                 return time.time() if has_more else None

@@ -15,7 +15,8 @@ from deploy.evaluation import modes_of, read_results
 from deploy.process import child_environment
 from deploy.run_folder import RunFolder
 from tests.faults.cells import Fault, Role
-from tests.faults.disturbed_run import EVALUATION_EPISODES, Healed, Outcome, preset_arguments
+from tests.faults.disturbed_run import Healed, Outcome
+from tests.faults.scenes import EVALUATION_EPISODES, Scene
 from tests.faults.witness import whole_lines
 from tests.process.accounting import Episode, Match, match_episodes
 from tests.process.recorded import settle_recording
@@ -145,11 +146,10 @@ def weights_digest(folder: RunFolder) -> str:
 class Undisturbed:
     """The same run in one process, at the lowest priority beside the disturbed one."""
 
-    def __init__(self, work: Path, seed: int) -> None:
+    def __init__(self, scene: Scene, work: Path, seed: int) -> None:
         self._runs = work / "undisturbed"
         self._log = work / "undisturbed.log"
-        arguments = preset_arguments(seed)
-        arguments[2:2] = ["--in-process", "--runs", str(self._runs)]
+        arguments = scene.run_arguments(work, seed, "--in-process", "--runs", str(self._runs))
         command = [sys.executable, "-c", _UNDISTURBED, *arguments]
         work.mkdir(parents=True, exist_ok=True)
         with self._log.open("ab") as log:

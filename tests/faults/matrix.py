@@ -16,9 +16,10 @@ from pathlib import Path
 from rich.console import Console
 
 from deploy.process import interrupt, on_terminate
-from tests.faults.cells import FAILPOINT_CELLS, Cell, Role, still_to_do
+from tests.faults.cells import Cell, still_to_do
 from tests.faults.disturbed_run import Healed, disturb
 from tests.faults.ledger import Undisturbed, settle_run
+from tests.faults.scenes import SCENES, Scene
 from tests.faults.table import Row, append_rows, draw, healed_cells, read_rows, rows_of
 
 ACTORS = 4
@@ -33,15 +34,16 @@ def main() -> int:
     options = _arguments()
     rows_path = options.rows or options.output.with_suffix(".jsonl")
     work = options.work or Path(tempfile.mkdtemp(prefix="clothbus-faults-"))
-    while missing := _missing(read_rows(rows_path), options.quick):
+    scene = SCENES[options.scene]
+    while missing := _missing(scene, read_rows(rows_path), options.quick):
         rows = read_rows(rows_path)
         seed = 1 + max((row["seed"] for row in rows), default=0)
         _console.print(f"{len(missing)} faults are missing; seed {seed} in {work}")
-        new = _one_run(work / f"seed-{seed}", seed, missing)
+        new = _one_run(scene, work / f"seed-{seed}", seed, missing)
         append_rows(rows_path, new)
-        options.output.write_text(draw(rows + new, ACTORS))
+        options.output.write_text(draw(scene, rows + new, ACTORS))
         shutil.rmtree(work / f"seed-{seed}")
-    options.output.write_text(draw(read_rows(rows_path), ACTORS))
+    options.output.write_text(draw(scene, read_rows(rows_path), ACTORS))
     _console.print(f"{options.output} is complete")
     with contextlib.suppress(OSError):
         work.rmdir()  # unless a run that is not settled is kept in it
@@ -52,6 +54,7 @@ def main() -> int:
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Disturbs runs, and draws the fault matrix.")
     parser.add_argument("--output", type=Path, required=True, help="the Markdown page")
+    parser.add_argument("--scene", choices=list(SCENES), default="learning", help="which run")
     parser.add_argument("--rows", type=Path, help="the rows; beside the page if not given")
     parser.add_argument("--work", type=Path, help="folder for the runs; temporary if not given")
     parser.add_argument(
@@ -60,23 +63,24 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _missing(rows: list[Row], quick: bool) -> list[Cell]:
+def _missing(scene: Scene, rows: list[Row], quick: bool) -> list[Cell]:
     done = healed_cells(rows)
     dice = random.Random(len(rows))
+    each = dict.fromkeys(scene.random_cells, 1 if quick else EACH)
     if not quick:
-        return still_to_do(EACH, AT_FAILPOINTS, done, dice)
-    first_points = {cell.role: cell for cell in reversed(FAILPOINT_CELLS)}
-    missing = still_to_do(1, 0, done, dice)
-    return missing + [
-        cell for role in Role if (cell := first_points.get(role)) and cell not in done
-    ]
+        each |= dict.fromkeys(scene.failpoint_cells, AT_FAILPOINTS)
+        return still_to_do(each, done, dice)
+    first_points = {cell.role: cell for cell in reversed(scene.failpoint_cells)}
+    return still_to_do(each, done, dice) + [it for it in first_points.values() if it not in done]
 
 
-def _one_run(work: Path, seed: int, missing: list[Cell]) -> list[Row]:
-    undisturbed = Undisturbed(work, seed)
+def _one_run(scene: Scene, work: Path, seed: int, missing: list[Cell]) -> list[Row]:
+    work.mkdir(parents=True, exist_ok=True)
+    scene.prepare(work)
+    undisturbed = Undisturbed(scene, work, seed)
     with contextlib.closing(undisturbed):
         dice = random.Random(seed)
-        outcome = disturb(work / "disturbed", seed, ACTORS, missing, dice, _tell)
+        outcome = disturb(scene, work / "disturbed", seed, ACTORS, missing, dice, _tell)
         ledger = settle_run(outcome, undisturbed.wait(UNDISTURBED_SECS))
     verdict = "settled" if ledger.is_settled else f"NOT SETTLED: {ledger}"
     _console.print(f"  {len(outcome.healed)} faults in {outcome.wall_secs:.0f} s: {verdict}")

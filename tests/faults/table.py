@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from broker_config.failpoints import Failpoint
-from tests.faults.cells import FAILPOINT_CELLS, Cell, Fault, Role
-from tests.faults.disturbed_run import EVALUATION_EPISODES, SETTINGS, Healed, Outcome
+from tests.faults.cells import Cell, Fault, Role
+from tests.faults.disturbed_run import Healed, Outcome
 from tests.faults.ledger import Ledger
+from tests.faults.scenes import EVALUATION_EPISODES, LEARNING, Scene
 
 Row = dict[str, Any]
 
@@ -76,7 +77,7 @@ def _cell(row: Row) -> Cell:
     return Cell(Role(row["role"]), Fault(row["fault"]), point)
 
 
-def draw(rows: Sequence[Row], actors: int) -> str:
+def draw(scene: Scene, rows: Sequence[Row], actors: int) -> str:
     """The page."""
     runs = [row for row in rows if row["kind"] == "run"]
     recoveries: defaultdict[Cell, list[float]] = defaultdict(list)
@@ -84,31 +85,34 @@ def draw(rows: Sequence[Row], actors: int) -> str:
         if row["kind"] == "fault" and row["recovery_secs"] is not None:
             recoveries[_cell(row)].append(row["recovery_secs"])
     parts = [
-        _introduction(rows, runs, actors),
+        _introduction(scene, rows, runs, actors),
         "## Nothing lost, nothing double",
         _totals(runs),
         "## Recovery after faults at random moments",
-        _random_table(recoveries),
+        _random_table(scene, recoveries),
         "## Recovery after kills at the failpoints",
-        _failpoint_table(recoveries),
+        _failpoint_table(scene, recoveries),
         _explanation(),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _introduction(rows: Sequence[Row], runs: Sequence[Row], actors: int) -> str:
+def _introduction(scene: Scene, rows: Sequence[Row], runs: Sequence[Row], actors: int) -> str:
     faults = sum(row["kind"] == "fault" for row in rows)
     equal = sum(row["weights"] == row["undisturbed_weights"] for row in runs)
-    settings = " ".join(SETTINGS)
+    settings = " ".join(scene.all_settings)
+    made_by = "make faults" if scene is LEARNING else f"make faults-of-{scene.name}"
+    page = "fault_matrix" if scene is LEARNING else f"fault_matrix_{scene.name}"
+    given = " --demonstrations ..." if scene.demonstrations else ""
     return (
-        "# Fault matrix\n\n"
-        "Made by `make faults`, which can be interrupted and goes on where it was; drawn from "
-        "`fault_matrix.jsonl`, one line for each fault and each run.\n\n"
+        f"# {scene.title}\n\n"
+        f"Made by `{made_by}`, which can be interrupted and goes on where it was; drawn from "
+        f"`{page}.jsonl`, one line for each fault and each run.\n\n"
         f"{len(runs)} runs with seeds of their own, {faults} faults, one at a time, each after the "
         f"last had healed. Final weights equal to those of the undisturbed run in one process: "
         f"**{equal} of {len(runs)}**.\n\n"
-        f"A run is `clothbus run reaching-smoke --actors {actors} --evaluate "
-        f"{EVALUATION_EPISODES} --evaluator-priority normal --set {settings} seed=...`, "
+        f"A run is `clothbus run {scene.preset} --actors {actors} --evaluate "
+        f"{EVALUATION_EPISODES} --evaluator-priority normal{given} --set {settings} seed=...`, "
         "with a recorder."
     )
 
@@ -135,20 +139,20 @@ def _totals(runs: Sequence[Row]) -> str:
     return "\n".join(["| counted | sum |", "|---|--:|", *(f"| {n} | {v} |" for n, v in table)])
 
 
-def _random_table(recoveries: dict[Cell, list[float]]) -> str:
+def _random_table(scene: Scene, recoveries: dict[Cell, list[float]]) -> str:
     lines = [
         "Seconds, p50 / p99 (number of faults).",
         "",
         "| role | " + " | ".join(Fault) + " |",
         "|---|" + "---|" * len(Fault),
     ]
-    for role in Role:
+    for role in scene.disturbed:
         cells = [_quantiles(recoveries.get(Cell(role, fault), [])) for fault in Fault]
         lines.append(f"| {role} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def _failpoint_table(recoveries: dict[Cell, list[float]]) -> str:
+def _failpoint_table(scene: Scene, recoveries: dict[Cell, list[float]]) -> str:
     lines = [
         "Seconds, p50 / p99 (number of kills). Each point is named for what has just been done.",
         "",
@@ -157,7 +161,7 @@ def _failpoint_table(recoveries: dict[Cell, list[float]]) -> str:
     ]
     lines += [
         f"| {cell.role} | {cell.failpoint} | {_quantiles(recoveries.get(cell, []))} |"
-        for cell in FAILPOINT_CELLS
+        for cell in scene.failpoint_cells
     ]
     return "\n".join(lines)
 
@@ -176,8 +180,8 @@ def _explanation() -> str:
   the next useful act: an actor's next trajectory is journalled; after a fault of the learner, the
   next ticket or trajectory is journalled; after one of the router, the next trajectory; the
   recorder has caught up with the journal (its heartbeats tell, twice a second); the evaluator's
-  next episode is in its file. Only acts of the new process count. An actor's time includes its wait
-  for a ticket and a whole episode.
+  next episode is in its file; the discriminators' next rewards are journalled. Only acts of the
+  new process count. An actor's time includes its wait for a ticket and a whole episode.
 * With few faults in a cell, p99 is nearly the longest of them.
 * *Cut off* are steps of an episode that its process had not spooled when it died. A simulator plays
   such an episode again from its seed; a robot spools every step before the next.

@@ -21,6 +21,7 @@ _COMMANDS = {
     "actor": Role.ACTOR,
     "record": Role.RECORDER,
     "evaluator": Role.EVALUATOR,
+    "discriminator": Role.DISCRIMINATOR,
 }
 _BATCH_BYTES = 8 << 20
 

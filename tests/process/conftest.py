@@ -167,7 +167,7 @@ def undisturbed_weights(folder: Path, *settings: str) -> bytes:
             Trainer(preset),
             CheckpointStore(folder / "checkpoints"),
             snapshots,
-            (),
+            None,
             InProcessActor(owner, env, snapshots).play_until_ready,
         )
         for _ in loop:

@@ -8,7 +8,14 @@ from pathlib import Path
 
 from broker_config.codec import decode
 from broker_config.journal import JournalReader
-from broker_config.messages import JournalEntry, RecordingGap, Snapshot, SnapshotTaken
+from broker_config.messages import (
+    AttemptEnded,
+    JournalEntry,
+    RecordingGap,
+    Snapshot,
+    SnapshotTaken,
+    Verdict,
+)
 from broker_config.recording import iter_recording
 
 
@@ -19,6 +26,9 @@ class RecordedAccount:
     entries: int
     """Of the journal."""
     trajectories: int
+    accepted: int
+    """Attempts that entered the memory; a ticket that is issued again on a busy machine may bring a
+    trajectory to spare."""
     snapshots: int
     """Policy versions with their weights."""
     missing_live: int
@@ -38,7 +48,7 @@ def settle_recording(folder: Path, journal_path: Path) -> RecordedAccount:
     """
     topics: Counter[str] = Counter()
     weights: dict[int, str] = {}
-    missing_live = entries = trajectories = 0
+    missing_live = entries = trajectories = accepted = 0
     with JournalReader(journal_path) as journal:
         expected = iter(journal)
         for item in iter_recording(folder):
@@ -51,6 +61,7 @@ def settle_recording(folder: Path, journal_path: Path) -> RecordedAccount:
                     assert item.topic == f"journal/{entry.name.split('/')[0]}"
                     entries += 1
                     trajectories += entry.name.startswith("trajectory/")
+                    accepted += _is_accepted(entry)
                     _check_weights(entry, weights)
                 case Snapshot() as snapshot:
                     assert weights.get(snapshot.version) != snapshot.digest, "recorded twice"
@@ -60,7 +71,15 @@ def settle_recording(folder: Path, journal_path: Path) -> RecordedAccount:
                     missing_live += gap.missing
         assert next(expected, None) is None, f"{entries} of {journal.end_offset} are recorded"
     segments = len(list(folder.glob("*.mcap")))
-    return RecordedAccount(entries, trajectories, len(weights), missing_live, topics, segments)
+    return RecordedAccount(
+        entries, trajectories, accepted, len(weights), missing_live, topics, segments
+    )
+
+
+def _is_accepted(entry: JournalEntry) -> bool:
+    if not entry.name.startswith("ended/"):
+        return False
+    return decode(entry.payload, AttemptEnded).verdict is Verdict.ACCEPTED
 
 
 def _check_weights(entry: JournalEntry, weights: dict[int, str]) -> None:

@@ -46,7 +46,7 @@ def test_kill_9_of_the_recorder_loses_and_doubles_nothing(start: Start, tmp_path
 
     assert recorder_deaths(folder) == 2
     account = settle_recording(folder / "recording", folder / JOURNAL_FILE)
-    assert account.trajectories == 16
+    assert account.accepted == 16
     assert account.snapshots == 17
     assert account.segments == 3
     assert account.topics["metrics/owner/learner"] > 0
@@ -81,8 +81,37 @@ def test_a_recorder_that_ends_at_each_of_its_failpoints_loses_nothing(
     assert run.wait(RUN_SECS) == 0, run.log.read_text()[-3000:]
     assert [point for point, flag in flags.items() if not flag.exists()] == []
     account = settle_recording(folder / "recording", folder / JOURNAL_FILE)
-    assert (account.trajectories, account.snapshots) == (8, 9)
+    assert (account.accepted, account.snapshots) == (8, 9)
     assert not list((folder / "recording").glob("*.partial"))
+
+
+@pytest.mark.timeout(400)
+def test_check_finds_a_run_that_imitates_whole_though_its_recorder_was_killed_twice(
+    start: Start, tmp_path: Path
+) -> None:
+    demonstrations = tmp_path / "demonstrations"
+    arguments = ["imitation-smoke", "--output", demonstrations, "--episodes", 3]
+    collected = start("demos", "demos", "make", *arguments)
+    assert collected.wait(60) == 0, collected.log.read_text()
+    arguments = ["imitation-smoke", "--demonstrations", demonstrations, "--actors", 3]
+    run = start("run", "run", *arguments, "--runs", tmp_path / "runs")
+    folder = the_run(tmp_path / "runs", run)
+    for count in (2, 7):
+        wait_for_trajectories(folder, count)
+        os.kill(heartbeat_pid(folder, "recorder"), signal.SIGKILL)
+    assert run.wait(RUN_SECS) == 0, run.log.read_text()[-3000:]
+
+    check = start("check", "check", folder, "--against", folder)
+    assert check.wait(60) == 0, check.log.read_text()
+    said = check.log.read_text()
+    assert said.count("began with journal entry") == 3
+    assert "recording: whole; " in said
+    assert "4 rewards" in said
+    part = start("slice", "slice", folder, "--output", tmp_path / "part", "--iterations", "1-2")
+    assert part.wait(60) == 0, part.log.read_text()
+    check = start("check-part", "check", tmp_path / "part", "--against", folder)
+    assert check.wait(60) == 0, check.log.read_text()
+    assert "2 rewards" in check.log.read_text()
 
 
 @pytest.mark.timeout(200)

@@ -189,6 +189,9 @@ def test_the_robot_can_make_every_flip() -> None:
     assert info["action_mask"].all()
     moved, _, _, _, info = env.step(2 * 6 + 3)
     assert info["unreachable"] is None
+    motion = info["motion"]
+    assert motion.joints_rad.shape == (len(motion.times_secs), len(motion.names))
+    assert env.reset(seed=0)[1].get("motion") is None
     assert (moved != picture).any()
     env.close()
 
@@ -206,6 +209,7 @@ def test_what_the_robot_cannot_do_is_masked_reported_and_not_done() -> None:
         if info["unreachable"] is not None:
             n_refused += 1
             assert info["unreachable"] in {"out_of_reach", "joint_limit", "self_collision"}
+            assert (info["marks"], info["motion"]) == ((), None)
             np.testing.assert_array_equal(picture, before)
     assert 0 < n_refused < 5
     assert env.action_space.sample(info["action_mask"]) in np.flatnonzero(info["action_mask"])

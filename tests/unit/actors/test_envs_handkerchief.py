@@ -72,6 +72,10 @@ def test_reward_is_the_red_portion_of_the_picture() -> None:
     assert (terminated, truncated) == (False, False)
     assert info["drop_xy_m"] == (-0.12, -0.09)
     column, row = info["pick_px"]
+    pick, drop = info["marks"]
+    assert (pick.kind, pick.points_px) == ("pick", ((column + 0.5, row + 0.5),))
+    ((x_px, y_px),) = drop.points_px
+    assert (drop.kind, x_px < 42 < y_px) == ("drop", True)
     assert column > 42 > row
 
 

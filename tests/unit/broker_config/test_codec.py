@@ -16,14 +16,26 @@ from broker_config.errors import DecodeError, MessageError, SchemaMismatch
 from broker_config.messages import (
     Ack,
     Attach,
+    DemonstrationsBegun,
+    Demonstrator,
+    DiscriminatorSnapshot,
+    FoundQuality,
     Heartbeat,
+    ImportedDataset,
     Instruction,
+    IterationAnnounced,
+    JointMotion,
     JournalBatch,
     JournalEntry,
     JournalRequest,
+    Mark,
     Metrics,
     Refusal,
+    Rewards,
+    RewardsAck,
     Snapshot,
+    SnapshotPlayed,
+    TargetsMarked,
     Ticket,
     TicketReply,
     TicketRequest,
@@ -31,6 +43,7 @@ from broker_config.messages import (
     TrajectoryId,
     Verdict,
     View,
+    generated_digest,
     weights_digest,
 )
 from broker_config.specs import NetworkSpec
@@ -85,6 +98,23 @@ def ticket_replies(draw):
     return TicketReply(instruction, draw(ids), draw(counts), ticket)
 
 
+points = st.tuples(finite, finite)
+marks = st.lists(
+    st.builds(Mark, st.sampled_from(["pick", "drop"]), st.tuples(points))
+    | st.builds(Mark, st.just("fold_line"), st.tuples(points, points)),
+    max_size=4,
+).map(tuple)
+
+
+@st.composite
+def motions(draw):
+    joints = tuple(draw(st.lists(texts, min_size=1, max_size=3)))
+    k = draw(st.integers(1, 4))
+    secs = arrays.arrays(np.float32, k, elements=st.floats(0, 100, width=32))
+    angles = arrays.arrays(np.float32, (k, len(joints)), elements=st.floats(-4, 4, width=32))
+    return JointMotion(joints, draw(secs), draw(angles))
+
+
 @st.composite
 def views(draw):
     step = draw(st.integers(0, 3))
@@ -92,10 +122,60 @@ def views(draw):
     reward = draw(finite) if step else None
     numbers = [draw(counts) for _ in range(4)]
     picture = draw(st.binary(max_size=50)), draw(st.sampled_from(["png", "jpeg"])), draw(finite)
-    return View(draw(ids), draw(ids), *numbers, step, action, reward, *picture)
+    done = (draw(marks), draw(st.none() | motions())) if step else ()
+    return View(draw(ids), draw(ids), *numbers, step, action, reward, *picture, *done)
+
+
+@st.composite
+def announcements(draw):
+    generated = draw(st.lists(trajectory_ids, min_size=1, max_size=4).map(tuple))
+    samples = len(generated) + draw(st.integers(0, 100))
+    digest = generated_digest(generated, samples)
+    return IterationAnnounced(draw(counts), digest, samples, generated)
+
+
+@st.composite
+def rewards(draw):
+    given = draw(arrays.arrays(np.float32, 3, elements=st.floats(-5, 5, width=32)))
+    versions = draw(st.sampled_from([(1, 1), (None, 2), (3, None)]))
+    state = draw(st.binary(max_size=50))
+    digests = weights_digest(b"of D_G"), weights_digest(state)
+    names = draw(ids), draw(ids), draw(counts)
+    return Rewards(*names, digests[0], given, *versions, state, digests[1], draw(numbers))
+
+
+@st.composite
+def discriminator_snapshots(draw):
+    weights = draw(st.binary(max_size=50))
+    digest = weights_digest(weights)
+    return DiscriminatorSnapshot(draw(ids), draw(counts), 1, None, weights, digest)
+
+
+rates = st.floats(0, 1)
+qualities = st.builds(FoundQuality, finite, finite, finite, finite, counts)
+digests = st.from_regex(r"[0-9a-f]{64}", fullmatch=True)
+demonstrators = st.one_of(
+    st.builds(Demonstrator, st.just("scripted"), rates, st.none() | qualities),
+    st.just(Demonstrator("random")),
+    st.builds(
+        Demonstrator,
+        st.just("imported"),
+        dataset=st.builds(ImportedDataset, texts.filter(bool), digests, texts),
+    ),
+    st.builds(
+        Demonstrator,
+        st.just("policy"),
+        snapshot=st.builds(SnapshotPlayed, ids, counts, digests, rates),
+    ),
+)
+states = st.sets(st.integers(1, 1000), max_size=9).map(lambda some: tuple(sorted(some)))
 
 
 any_message = st.one_of(
+    announcements(),
+    rewards(),
+    discriminator_snapshots(),
+    st.builds(RewardsAck, counts, counts, counts, st.booleans()),
     trajectories(),
     snapshots(),
     ticket_replies(),
@@ -107,6 +187,8 @@ any_message = st.one_of(
         Heartbeat, st.just("actor"), ids, ids, texts, counts, texts, st.floats(0, 1e9), numbers
     ),
     views(),
+    st.builds(DemonstrationsBegun, demonstrators, counts, texts, texts),
+    st.builds(TargetsMarked, trajectory_ids, states),
     st.builds(JournalRequest, st.just("recorder"), ids, ids, counts, counts, st.integers(1, 2**60)),
     st.builds(Ack, trajectory_ids, counts, counts, st.sampled_from(Verdict), st.booleans()),
     st.builds(
@@ -224,7 +306,16 @@ def test_every_message_of_the_contract_has_a_size_limit():
         for kind in vars(messages).values()
         if dataclasses.is_dataclass(kind) and kind.__module__.startswith(messages.__name__)
     }
-    parts = {Ticket, TrajectoryId}
+    parts = {
+        Demonstrator,
+        FoundQuality,
+        ImportedDataset,
+        JointMotion,
+        Mark,
+        SnapshotPlayed,
+        Ticket,
+        TrajectoryId,
+    }
     assert defined - parts == set(SIZE_LIMITS)
     assert typing.get_type_hints(codec)["SIZE_LIMITS"] == dict[type, int]
 

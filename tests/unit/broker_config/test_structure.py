@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from broker_config.errors import MessageError
-from broker_config.structure import from_plain, to_plain
+from broker_config.structure import added, from_plain, to_plain
 
 
 class Colour(StrEnum):
@@ -114,3 +114,23 @@ def test_long_values_are_cut_in_errors():
     with pytest.raises(MessageError) as error:
         from_plain({"number": "x" * 10_000}, Inner, "inner")
     assert len(str(error.value)) < 200
+
+
+@dataclass(frozen=True)
+class Older:
+    size: int
+
+
+@dataclass(frozen=True)
+class Newer:
+    size: int
+    colour: str | None = added(None)
+
+
+def test_a_field_that_was_added_is_written_only_where_it_is_used():
+    assert to_plain(Newer(3)) == to_plain(Older(3))
+    assert from_plain(to_plain(Older(3)), Newer, "it") == Newer(3)
+    used = Newer(3, "red")
+    assert from_plain(to_plain(used), Newer, "it") == used
+    with pytest.raises(MessageError, match="got also colour"):
+        from_plain(to_plain(used), Older, "it")

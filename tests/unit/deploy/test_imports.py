@@ -11,18 +11,30 @@ NEITHER_LEARNS_NOR_ACTS = """
 import deploy.cli, deploy.recorder, deploy.roles, deploy.run, deploy.status
 """
 
-LEARNS_AND_REACHES = """
-import numpy as np
-import deploy.roles, learner.metrics, learner.service, actors.service
+REACHES = """
+import actors.service, deploy.roles
 from actors.task import make_task_env
+from deploy.presets import load_preset
+preset = load_preset("reaching-smoke")
+env = make_task_env(preset.task)
+env.reset(seed=0)
+env.step(0)
+"""
+
+LEARNS = """
+import numpy as np
+import deploy.roles, learner.metrics, learner.service
 from deploy.presets import load_preset
 from learner.trainer import Trainer
 preset = load_preset("reaching-smoke")
-env, trainer = make_task_env(preset.task), Trainer(preset)
-observations = np.stack([env.reset(seed=0)[0], env.step(0)[0]])
+trainer = Trainer(preset)
+observations = np.zeros((2, *preset.task.observation_shape), np.uint8)
 trainer.add(observations, np.zeros(1, np.int32), np.zeros(1, np.float32), terminated=False)
 trainer.update(1)
 """
+
+SLOW_FOR_ALL = {"torch._dynamo", "sympy", "pybullet", "matplotlib"}
+"""The first two are torch's own compiler, which takes seconds."""
 
 
 def imported(program: str) -> set[str]:
@@ -35,7 +47,13 @@ def test_commands_that_neither_learn_nor_act_import_neither_torch_nor_a_simulato
     assert not imported(NEITHER_LEARNS_NOR_ACTS) & HEAVY
 
 
-def test_learning_and_reaching_import_no_compiler_no_cloth_and_nothing_that_draws() -> None:
-    modules = imported(LEARNS_AND_REACHES)
+def test_reaching_imports_no_compiler_no_cloth_and_nothing_that_draws() -> None:
+    modules = imported(REACHES)
     assert {"torch", "gymnasium"} <= modules
-    assert not modules & {"torch._dynamo", "sympy", "numba", "pybullet", "matplotlib"}
+    assert not modules & {*SLOW_FOR_ALL, "numba"}
+
+
+def test_learning_imports_numba_alone_of_the_compilers() -> None:
+    modules = imported(LEARNS)
+    assert {"torch", "numba"} <= modules
+    assert not modules & SLOW_FOR_ALL

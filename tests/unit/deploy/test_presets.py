@@ -129,7 +129,8 @@ def test_imitation_of_chapter_4_is_the_source_s(name: str) -> None:
     "name", [path.stem for path in PATHS if "ch3" in path.stem or "smoke" in path.stem]
 )
 def test_the_dqn_baselines_are_overrides(name: str, head: str) -> None:
-    preset = load(name, "algorithm.method=dqn", f"algorithm.head={head}")
+    overrides = ("algorithm.method=dqn", "algorithm.sigma=0.0", f"algorithm.head={head}")
+    preset = load(name, *overrides)
     assert preset.exploration is not None
     assert preset.exploration.epsilon(0) == 1.0
     assert preset.exploration.epsilon(preset.schedule.episodes) == pytest.approx(0.1)

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
 
-from broker_config.errors import PresetError, StorageError
+from broker_config.errors import PresetError
 from deploy.presets import load_preset
-from deploy.quality import QUALITY_FILE, TOLERANCE, find_quality, kept_quality
+from deploy.quality import TOLERANCE, find_quality
 
 TASK = load_preset("reaching-smoke").task
 
@@ -19,7 +16,8 @@ def test_more_mistakes_are_made_where_less_is_wanted() -> None:
     rates = []
     for wanted in (1.0, 0.7, 0.3, 0.0):
         found = find_quality(TASK, wanted, 20, on_measured=tried.__setitem__)
-        assert found.measured == pytest.approx(wanted, abs=TOLERANCE + 0.03)
+        assert found.quality is not None
+        assert found.quality.measured == pytest.approx(wanted, abs=TOLERANCE + 0.03)
         rates.append(found.mistake_rate)
     assert rates == sorted(rates)
     assert (rates[0], rates[-1]) == (0.0, 1.0)
@@ -28,22 +26,6 @@ def test_more_mistakes_are_made_where_less_is_wanted() -> None:
 
 def test_processes_do_not_change_what_is_found() -> None:
     assert find_quality(TASK, 0.5, 6, jobs=2) == find_quality(TASK, 0.5, 6)
-
-
-def test_a_quality_is_measured_once_and_kept(tmp_path: Path) -> None:
-    first = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
-    path = tmp_path / "demos" / QUALITY_FILE
-    path.write_text(path.read_text().replace('"measured": ', '"measured": 1'))  # as nobody would
-    again = kept_quality(tmp_path / "demos", TASK, 0.5, 6)
-    assert again.mistake_rate == first.mistake_rate
-    assert again.measured != first.measured
-    other_task = replace(TASK, horizon=TASK.horizon + 1)
-    for wanted, episodes, task in ((0.6, 6, TASK), (0.5, 7, TASK), (0.5, 6, other_task)):
-        with pytest.raises(StorageError, match=f"expected quality {wanted} over {episodes}"):
-            kept_quality(tmp_path / "demos", task, wanted, episodes)
-    path.write_text("{}")
-    with pytest.raises(StorageError, match="expected a quality; got"):
-        kept_quality(tmp_path / "demos", TASK, 0.5, 6)
 
 
 def test_what_is_no_quality_is_refused() -> None:

@@ -15,15 +15,25 @@ from broker_config.errors import AlreadyOwned, PresetError, StorageError
 from broker_config.messages import Trajectory
 from broker_config.ownership import FileLock
 from broker_config.preset import Preset
+from deploy.make_demonstrations import LEAST_TARGETS
 from deploy.presets import preset_names
 from deploy.reproduce import command
 from deploy.reproduce.catalogue import EXPERIMENTS, find
 from deploy.reproduce.chapter3 import DPN, DQN, DUELING_DPN, SUPERVISED
-from deploy.reproduce.chapter4 import BID, CLONING, QGAIL
+from deploy.reproduce.chapter4 import (
+    BID,
+    CLONING,
+    CLONING_AUGMENTED,
+    PGAIL,
+    PRETRAINED_BID,
+    QGAIL,
+    SQIL,
+)
 from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
-from deploy.reproduce.demonstrations import LEAST_TARGETS, demonstrations_of
+from deploy.reproduce.demonstrations import demonstrations_of
 from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
-from deploy.reproduce.in_process_run import InProcessRun, policy_file
+from deploy.reproduce.in_process_run import InProcessRun
+from deploy.reproduce.kept_weights import policy_file
 from deploy.reproduce.runs import (
     CurvePoint,
     FinishedRun,
@@ -35,9 +45,9 @@ from deploy.reproduce.runs import (
     write_runs,
 )
 from discriminator.real_states import real_states
-from learner.cloning import cloning_preset
-from learner.compute import ON_CPU, Compute
-from learner.recorded import first_samples
+from learner.cloning import clone, cloning_preset
+from learner.steps.compute import ON_CPU, Compute
+from learner.teaching_signal import epsilon_greedy_value, soft_value
 
 torch.set_num_threads(1)  # as the runs' own processes have
 
@@ -177,13 +187,16 @@ def test_a_cloned_policy_does_what_was_demonstrated(tmp_path: Path) -> None:
     assert np.mean(agrees) > 0.8
 
 
-@pytest.mark.parametrize("condition", [BID, QGAIL, CLONING], ids=lambda it: it.name)
+IMITATORS = (BID, PRETRAINED_BID, QGAIL, SQIL, CLONING, CLONING_AUGMENTED)
+
+
+@pytest.mark.parametrize("condition", IMITATORS, ids=lambda it: it.name)
 def test_an_interrupted_imitation_goes_on_as_if_it_had_not_been(
     tmp_path: Path, condition: Condition
 ) -> None:
     plan = IMITATION.plan(IMITATION.panels[0], condition, 0)
     assert plan.key.mistake_rate == 0.1
-    last = 0 if condition is CLONING else 2
+    last = 0 if condition in (CLONING, CLONING_AUGMENTED) else 2
     with InProcessRun(plan, tmp_path / "whole") as whole:
         list(whole.finish(last))
         expected = whole.keep_policy().read_bytes()
@@ -205,6 +218,76 @@ def test_imitation_learns_from_the_discriminators_rewards_alone(tmp_path: Path) 
         rewards = discriminators.rewards(memory.states_after())
     assert torch.equal(memory.samples.rewards, rewards)
     assert len(rewards) == 60
+
+
+@pytest.mark.parametrize("discriminators", ["expert", "target", "both"])
+@pytest.mark.parametrize("generator", ["edpn", "dqn"])
+def test_two_switches_make_every_variant(
+    tmp_path: Path, generator: str, discriminators: str
+) -> None:
+    """And a fixed horizon tells nothing: the last step of an episode is worth what follows it."""
+    overrides = [f"algorithm.method={generator}", f"imitation.discriminators={discriminators}"]
+    overrides += ["algorithm.sigma=0.0"] if generator == "dqn" else []
+    condition = Condition("variant", "variant", "C0", tuple(overrides))
+    plan = IMITATION.plan(IMITATION.panels[0], condition, 0)
+    with InProcessRun(plan, tmp_path) as run:
+        list(run.finish(1))
+        assert run._discriminators is not None
+        wanted = ("expert", "target") if discriminators == "both" else (discriminators,)
+        assert run._discriminators.names == wanted
+        memory, learned = run._trainer.memory, run._trainer._assess()
+        assert not memory.samples.terminated.any()
+        assert len(memory) == 2 * plan.preset.task.horizon  # no episode was shorter
+        after = run._trainer._network(memory.states_after()).detach()
+    algorithm = plan.preset.algorithm
+    if generator == "dqn":
+        epsilon = run._trainer._epsilon()
+        values = epsilon_greedy_value(after, epsilon)
+    else:
+        values = soft_value(after, algorithm.beta)
+    expected = memory.samples.rewards + algorithm.gamma * values
+    torch.testing.assert_close(learned.bellman_targets, expected, atol=1e-4, rtol=1e-4)
+
+
+def test_sqil_has_the_same_demonstrations_and_as_many_gradient_steps(tmp_path: Path) -> None:
+    steps = {}
+    for condition in (PGAIL, SQIL):
+        plan = IMITATION.plan(IMITATION.panels[0], condition, 0)
+        with InProcessRun(plan, tmp_path) as run:
+            steps[condition.name] = list(run.finish())[-1].gradient_steps
+            memory = run._trainer.memory
+    assert steps["sqil"] == steps["pgail"]
+    demonstrations = demonstrations_of(IMITATION.plan(IMITATION.panels[0], BID, 0), tmp_path)
+    assert memory.n_held == sum(each.steps for each in demonstrations) == 40
+    held = memory.minibatch(torch.arange(40))
+    assert held.actions.tolist() == np.concatenate([it.actions for it in demonstrations]).tolist()
+    own = len(memory) - 40
+    assert memory.samples.rewards.tolist() == [1.0] * 40 + [0.0] * own
+
+
+def test_augmentation_is_that_of_discriminators(tmp_path: Path) -> None:
+    """Without a table of theirs nothing says how pictures are changed."""
+    augmented = replace(SUPERVISED, name="augmented", start="cloned-augmented")
+    with (
+        InProcessRun(smoke_plan(augmented), tmp_path) as run,
+        pytest.raises(PresetError, match=r"expected an \[imitation\] table, whose"),
+    ):
+        next(run.finish(0))
+
+
+def test_a_pretrained_generator_begins_as_a_clone_and_is_trained_further(tmp_path: Path) -> None:
+    plan = IMITATION.plan(IMITATION.panels[0], PRETRAINED_BID, 0)
+    epochs = plan.preset.imitation.generator_epochs
+    cloned = clone(plan.preset, demonstrations_of(plan, tmp_path), epochs)
+    with InProcessRun(plan, tmp_path) as run:
+        begun = next(run.finish(1))
+        weights = run._trainer.weights()
+        (trained,) = run.finish(1)
+        trained_weights = run._trainer.weights()
+    assert all(torch.equal(weights[name], part) for name, part in cloned.weights.items())
+    assert (begun.loss, begun.gradient_steps) == (cloned.loss, cloned.gradient_steps)
+    assert trained.gradient_steps > begun.gradient_steps
+    assert any(not torch.equal(trained_weights[name], part) for name, part in weights.items())
 
 
 def test_a_run_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
@@ -232,8 +315,8 @@ def test_two_commands_do_not_write_over_each_other(tmp_path: Path) -> None:
 def test_a_run_does_not_go_on_by_another_path(tmp_path: Path) -> None:
     with InProcessRun(smoke_plan(), tmp_path) as begun:
         next(begun.finish())
-    with pytest.raises(StorageError, match=r"go on by reference steps on cpu.*got products steps"):
-        InProcessRun(smoke_plan(), tmp_path, Compute(path="products"))
+    with pytest.raises(StorageError, match=r"go on by winograd steps on cpu.*got reference steps"):
+        InProcessRun(smoke_plan(), tmp_path, Compute(path="reference"))
 
 
 def test_demonstrations_to_imitate_show_enough_targets(tmp_path: Path) -> None:
@@ -247,15 +330,6 @@ def test_demonstrations_to_imitate_show_enough_targets(tmp_path: Path) -> None:
     never = with_changes(IMITATION, 1, ["imitation.target_reward=0.0"])
     with pytest.raises(StorageError, match="expected at least 3 target states"):
         demonstrations_of(never.plan(never.panels[0], BID, 0), tmp_path)
-
-
-def test_what_was_cut_off_has_not_succeeded(tmp_path: Path) -> None:
-    (whole, *_) = demonstrations_of(smoke_plan(INITIALISED), tmp_path)
-    succeeded = replace(whole, success=True)
-    (cut,) = first_samples([succeeded], whole.steps - 1)
-    assert (cut.steps, cut.success, cut.terminated) == (whole.steps - 1, False, False)
-    (kept,) = first_samples([succeeded], whole.steps)
-    assert kept == succeeded
 
 
 def test_runs_that_were_not_followed_so_far_are_not_drawn(tmp_path: Path) -> None:
@@ -320,6 +394,31 @@ def test_some_conditions_alone() -> None:
         with_changes(SMOKE, conditions=["sarsa"])
 
 
+def test_a_run_of_two_panels_is_made_once() -> None:
+    shown_again = replace(SMOKE, panels=(*SMOKE.panels, replace(SMOKE.panels[0], title="again")))
+    assert list(shown_again.plans()) == list(SMOKE.plans())
+
+
+def test_a_panel_may_have_other_seeds() -> None:
+    (panel,) = SMOKE.panels
+    later = replace(SMOKE, panels=(replace(panel, first_seed=100),))
+    assert {plan.key.seed for plan in later.plans()} == {100 + it for it in range(panel.seeds)}
+
+
+def test_some_panels_alone() -> None:
+    other = replace(SMOKE.panels[0], title="other", overrides=("algorithm.gamma=0.5",))
+    both = replace(SMOKE, panels=(*SMOKE.panels, other))
+    chosen = with_changes(both, panels=["other"])
+    assert {it.key for it in chosen.plans()} == {it.key for it in both.plans()} - {
+        it.key for it in SMOKE.plans()
+    }
+    with pytest.raises(PresetError, match=r"expected panels of .*other.*got another"):
+        with_changes(both, panels=["another"])
+    few = replace(both, panels=(*SMOKE.panels, replace(other, conditions=other.conditions[:1])))
+    with pytest.raises(PresetError, match="got none of dqn in other"):
+        with_changes(few, conditions=["dqn"], panels=["other"])
+
+
 def test_there_must_be_such_an_experiment() -> None:
     with pytest.raises(PresetError, match=r"expected one of dpn-vs-dqn.*got nothing"):
         find("nothing")
@@ -374,3 +473,14 @@ def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
     assert "DPN's area under the curve is above DQN's: the mean paired difference is +3.00" in page
     assert "| DPN - DQN | +2.00, +4.00, +3.00 | +3.00 | +2.00 to +4.00 | +0.52 to +5.48 |" in page
     assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
+
+
+def test_each_method_has_the_same_budget_on_seeds_that_are_not_reported() -> None:
+    tuning = EXPERIMENTS["tuning-5-joints"]
+    tried = [
+        {(plan.key.preset_digest, plan.key.seed) for plan in replace(tuning, panels=(it,)).plans()}
+        for it in tuning.panels
+    ]
+    assert [len(runs) for runs in tried] == [16] * 4
+    reported = {seed for panel in EXPERIMENTS["figure-3.5"].panels for seed in panel.seed_numbers}
+    assert not reported & {seed for panel in tuning.panels for seed in panel.seed_numbers}

@@ -7,8 +7,10 @@ from deploy.reproduce.statistics import (
     area_under_curve,
     bootstrap_band,
     bootstrap_interval,
+    hierarchical_interval,
     interquartile_mean,
     paired_difference,
+    rank_correlation,
     student_t_quantile,
 )
 
@@ -78,3 +80,33 @@ def test_the_band_is_around_the_interquartile_mean() -> None:
     assert (interquartile_mean(curves) < high).all()
     assert (high - low < 3.0).all()
     assert bootstrap_interval(np.array([2.0])) == (2.0, 2.0)
+
+
+def test_rank_correlation_is_of_orders_alone() -> None:
+    values = np.array([0.1, 5.0, 2.0, 3.0])
+    assert rank_correlation(values, np.exp(values)) == pytest.approx(1.0)
+    assert rank_correlation(values, -(values**3)) == pytest.approx(-1.0)
+    # Without ties: 1 - 6 * sum(d**2) / (n * (n**2 - 1)), here with d = 1, 1, 1, 1.
+    other = np.array([2.0, 3.0, 1.0, 4.0])
+    assert rank_correlation(values, other) == pytest.approx(1 - 6 * 4 / (4 * 15))
+
+
+def test_equal_values_share_a_rank() -> None:
+    # Ranks 0.5, 0.5, 2 against 0, 1, 2: covariance 1.5 over sqrt(1.5 * 2).
+    tied = rank_correlation(np.array([1.0, 1.0, 7.0]), np.array([1.0, 2.0, 3.0]))
+    assert tied == pytest.approx(1.5 / math.sqrt(1.5 * 2.0))
+    assert math.isnan(rank_correlation(np.ones(3), np.arange(3.0)))
+    with pytest.raises(ValueError, match="as many values"):
+        rank_correlation(np.ones(3), np.ones(2))
+
+
+def test_a_hierarchical_interval_is_as_wide_as_the_seeds_are_apart() -> None:
+    apart = np.repeat([[0.0], [1.0], [0.0], [1.0]], 100, axis=1)  # all trials of a seed agree
+    low, high = hierarchical_interval(apart)
+    assert (low, high) == (0.0, 1.0)  # as if there were four trials, not four hundred
+    alike = np.tile([0.0, 1.0], (4, 50))
+    low, high = hierarchical_interval(alike)
+    assert 0.42 < low < 0.5 < high < 0.58
+    # Trials of a single seed are still drawn anew.
+    low, high = hierarchical_interval(np.array([[0.0, 1.0]]))
+    assert (low, high) == (0.0, 1.0)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch
 
-from discriminator.augmentation import colour_jitter, random_shift
+from discriminator.augmentation import colour_jitter, random_shift, random_turn
 
 
 def generator_of(seed: int) -> torch.Generator:
@@ -34,6 +37,36 @@ def shifted_by_hand(picture: torch.Tensor, down: int, right: int) -> torch.Tenso
     return picture[:, rows][:, :, columns]
 
 
+def test_pictures_are_turned_about_their_centre_and_keep_their_shape() -> None:
+    height, width = 40, 60
+    down, right = torch.meshgrid(
+        torch.arange(height) - 19.5, torch.arange(width) - 29.5, indexing="ij"
+    )
+    bar = ((down.abs() <= 3) & (right.abs() <= 14)).float()
+    turned = random_turn(bar.expand(60, 1, height, width), 30.0, generator_of(0))[:, 0]
+    length = ((bar * right**2).sum() / bar.sum()).sqrt().item()
+    angles_deg = []
+    for picture in turned:
+        mass = picture.sum().item()
+        assert mass == pytest.approx(bar.sum().item(), rel=0.03)
+        assert abs((picture * down).sum().item() / mass) < 0.1
+        across, along, athwart = (
+            (picture * a * b).sum().item() for a, b in ((down, right), (right, right), (down, down))
+        )
+        angle_rad = 0.5 * math.atan2(2 * across, along - athwart)
+        place = right * math.cos(angle_rad) + down * math.sin(angle_rad)
+        spread = (picture * place**2).sum().item() / mass
+        assert math.sqrt(spread) == pytest.approx(length, rel=0.03)
+        angles_deg.append(math.degrees(angle_rad))
+    assert 25 < max(angles_deg) <= 31
+    assert -31 <= min(angles_deg) < -25
+
+
+def test_a_turned_picture_repeats_its_border() -> None:
+    pictures = torch.full((3, 1, 10, 14), 0.25)
+    assert torch.allclose(random_turn(pictures, 180.0, generator_of(0)), pictures)
+
+
 def test_colours_are_scaled_channel_by_channel() -> None:
     pictures = torch.full((50, 3, 4, 4), 0.5)
     changed = colour_jitter(pictures, 0.2, generator_of(0))
@@ -47,5 +80,6 @@ def test_colours_are_scaled_channel_by_channel() -> None:
 
 def test_none_asked_for_is_none_made() -> None:
     pictures = torch.rand((2, 3, 8, 8), generator=generator_of(0))
+    assert random_turn(pictures, 0.0, generator_of(1)) is pictures
     assert random_shift(pictures, 0, generator_of(1)) is pictures
     assert colour_jitter(pictures, 0.0, generator_of(1)) is pictures

@@ -81,6 +81,18 @@ def test_one_discriminator_alone(which: Positives) -> None:
     assert torch.equal(both.logits(GENERATED)[which], alone.logits(GENERATED)[which])
 
 
+def test_the_prior_of_targets_is_the_target_discriminators_alone() -> None:
+    """What was demonstrated is no rare find among what the policy has reached."""
+    plain, unlabelled = (
+        Discriminators(preset_with(target_prior=prior), real()) for prior in (0.0, 0.3)
+    )
+    for each in (plain, unlabelled):
+        each.update(GENERATED)
+    with_prior, without = unlabelled.logits(GENERATED), plain.logits(GENERATED)
+    assert torch.equal(with_prior["expert"], without["expert"])
+    assert not torch.equal(with_prior["target"], without["target"])
+
+
 def test_epochs_end_once_it_is_right_often_enough() -> None:
     eager = Discriminators(preset_with(most_accuracy=0.6), real())
     reports = [eager.update(GENERATED) for _ in range(4)]

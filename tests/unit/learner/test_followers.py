@@ -187,7 +187,7 @@ def test_a_record_that_is_closed_is_final_and_takes_nothing_more(journal: Journa
     batch = follow(owner, request(offset=end_offset, held=end_offset))
     assert (batch.entries, batch.end_offset, batch.is_final) == ((), end_offset, True)
     assert owner.followers.behind(end_offset, -1.0) == []
-    with pytest.raises(StorageError, match="stays in the actor's spool"):
+    with pytest.raises(StorageError, match="what was sent is sent again"):
         owner.receive(_trajectory(), b"payload")
     assert journal.end_offset == end_offset
 

@@ -13,15 +13,16 @@ from actors.task import make_task_env
 from broker_config.codec import decode
 from broker_config.errors import PresetError
 from broker_config.journal import Journal
-from broker_config.messages import IterationEnded, SnapshotTaken, Trajectory, weights_digest
+from broker_config.messages import IterationEnded, SnapshotTaken, weights_digest
 from broker_config.preset import InitialisationPreset, Preset
-from deploy.collect import collect_demonstrations
+from deploy.demonstrators import by_script
 from deploy.in_process import InProcessActor
+from deploy.make_demonstrations import make_demonstrations
 from deploy.presets import load_preset
 from learner.checkpoint import CheckpointStore
 from learner.learning import EpisodeAbsorbed, LearningLoop, PolicyReady
 from learner.owner import Owner
-from learner.recorded import read_demonstrations
+from learner.recorded import Demonstrations, read_demonstrations
 from learner.snapshots import SnapshotStore
 from learner.trainer import Trainer
 
@@ -37,7 +38,7 @@ def beginner(folder: Path, stack: ExitStack) -> Begin:
     def begin_one(
         name: str = "run",
         preset: Preset = PRESET,
-        demonstrations: list[Trajectory] | None = None,
+        demonstrations: Demonstrations | None = None,
     ) -> Events:
         run = folder / name
         run.mkdir(exist_ok=True)
@@ -51,7 +52,7 @@ def beginner(folder: Path, stack: ExitStack) -> Begin:
             Trainer(preset),
             CheckpointStore(run / "checkpoints"),
             snapshots,
-            demonstrations or (),
+            demonstrations,
             actor.play_until_ready,
         )
         return iter(loop)
@@ -136,9 +137,9 @@ def test_algorithm_2_initialises_from_demonstrations_and_survives_a_restart(
 ) -> None:
     wanted = InitialisationPreset(demonstration_samples=25, target_switches=3)
     preset = dataclasses.replace(PRESET, initialisation=wanted)
-    recorded = list(collect_demonstrations(PRESET, tmp_path / "demos", 3, "scripted", 0.2))
+    made = make_demonstrations(PRESET, tmp_path / "demos", 3, by_script(PRESET, 0.2))
     demonstrations = read_demonstrations(tmp_path / "demos")
-    assert [item.id for item in demonstrations] == [item.id for item in recorded]
+    assert [it.id for it in demonstrations.trajectories] == [it.id for it in made.trajectories]
     first = next(begin("run", preset, demonstrations))
     assert isinstance(first, PolicyReady)
     assert first.report is not None

@@ -3,7 +3,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -11,6 +11,7 @@ from broker_config.errors import MessageError, StorageError
 from learner.memory import LocalMemory
 
 SHAPE = (2, 3, 1)
+ALL = torch.arange(100)
 
 
 @dataclass
@@ -19,6 +20,7 @@ class NaiveMemory:
 
     capacity: int
     samples: list[tuple[bytes, int, float, bytes, bool]] = field(default_factory=list)
+    held: list[tuple[bytes, int, float, bytes, bool]] = field(default_factory=list)
 
     def add(self, observations, actions, rewards, terminated) -> None:
         last = len(actions) - 1
@@ -26,7 +28,10 @@ class NaiveMemory:
             before, after = observations[t].tobytes(), observations[t + 1].tobytes()
             ended = terminated and t == last
             self.samples.append((before, int(action), float(reward), after, ended))
-        self.samples = self.samples[-self.capacity :]
+        self.samples = self.samples[-(self.capacity - len(self.held)) :]
+
+    def hold(self) -> None:
+        self.held, self.samples = self.samples, []
 
 
 def trajectory(
@@ -77,6 +82,60 @@ def test_equals_a_naive_memory(capacity: int, plan: list[tuple[int, bool, bool]]
             memory.set_state(state)
         assert contents(memory) == naive.samples
         assert torch.equal(memory.live_frames(0, memory.n_frames), memory.get_state()["frames"])
+
+
+@given(
+    st.integers(2, 14),
+    st.lists(st.integers(1, 5), min_size=1, max_size=4),
+    st.lists(st.tuples(st.integers(1, 15), st.booleans()), max_size=12),
+)
+def test_what_is_held_stays_while_others_age(
+    capacity: int, demonstrated: list[int], plan: list[tuple[int, bool]]
+) -> None:
+    memory, naive = LocalMemory(capacity, SHAPE), NaiveMemory(capacity)
+    for seed, length in enumerate(demonstrated):
+        parts = trajectory(length, 1000 + seed)
+        memory.add(*parts, terminated=False)
+        naive.add(*parts, False)
+    assume(len(memory) < capacity)
+    memory.hold()
+    naive.hold()
+    address = memory.ring.data_ptr()
+    for seed, (length, restores) in enumerate(plan):
+        parts = trajectory(length, seed)
+        memory.add(*parts, terminated=seed % 2 == 0)
+        naive.add(*parts, seed % 2 == 0)
+        state = memory.get_state()
+        if restores:
+            memory = LocalMemory(capacity, SHAPE)
+            address = memory.ring.data_ptr()
+            memory.set_state(state)
+        assert contents(memory) == naive.held + naive.samples
+        assert memory.n_held == len(naive.held)
+        n = memory.n_frames
+        parts_of_it = [memory.live_frames(start, start + 3) for start in range(0, n, 3)]
+        assert torch.equal(torch.cat(parts_of_it), state["frames"])
+        assert torch.equal(
+            memory.states_after(), memory.minibatch(ALL[: len(memory)]).next_observations
+        )
+    assert memory.ring.data_ptr() == address
+
+
+def test_refuses_to_hold_what_cannot_be_held() -> None:
+    for memory, got in ((LocalMemory(5, SHAPE), "got 0, 0"), (filled(5, [5]), "got 5, 0")):
+        with pytest.raises(MessageError, match=f"expected 1 to 4 samples to hold.*{got}"):
+            memory.hold()
+    memory = filled(9, [4])
+    memory.hold()
+    with pytest.raises(MessageError, match="got 4, 4 of them held"):
+        memory.hold()
+    memory.add(*trajectory(3, 0), terminated=False)
+    state = memory.get_state()
+    for n_held, message in ((0, "0 held"), (8, "8 held"), (2, "2 samples that end inside one")):
+        with pytest.raises(StorageError, match=message):
+            LocalMemory(9, SHAPE).set_state({**state, "held": torch.tensor(n_held)})
+    with pytest.raises(StorageError, match="room for others"):
+        LocalMemory(4, SHAPE).set_state({**filled(4, [4]).get_state(), "held": torch.tensor(4)})
 
 
 def test_stores_each_picture_once() -> None:

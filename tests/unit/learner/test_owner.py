@@ -22,6 +22,8 @@ from broker_config.messages import (
     IterationEnded,
     Refusal,
     SnapshotTaken,
+    TargetsMarked,
+    Ticket,
     TicketReply,
     TicketRequest,
     Trajectory,
@@ -32,8 +34,9 @@ from broker_config.messages import (
 from broker_config.preset import Preset
 from broker_config.version import VERSION
 from deploy.presets import load_preset
-from learner.owner import MOST_GENERATIONS, Owner
-from learner.recorded import accepted_trajectories
+from learner.owner import Owner
+from learner.recorded import Demonstrations, accepted_trajectories
+from learner.run_journal import MOST_GENERATIONS
 
 PRESET = load_preset("reaching-smoke", ["task.horizon=3"])
 
@@ -285,3 +288,51 @@ def test_a_sequence_number_below_the_newest_that_never_arrived_is_new(journal: J
     earlier = dataclasses.replace(sent, id=TrajectoryId("a", "life", 3))
     assert deliver(owner, earlier).duplicate is False
     assert deliver(owner, earlier).duplicate is True
+
+
+def test_demonstrations_and_what_was_marked_are_one_part_of_the_record(tmp_path: Path) -> None:
+    first, second = (demonstration(number) for number in range(2))
+    marked = Demonstrations((first, second), (TargetsMarked(second.id, (2, 3)),))
+    with Journal(tmp_path / "journal.sqlite") as journal:
+        own(journal).given.keep(marked)
+        named = {it.name: it for it in journal.entries() if it.name[0] in "dt"}
+        assert [*named] == ["demonstration/000000", "demonstration/000001", "target/000001"]
+        (mark,) = marked.marks or ()
+        assert decode(named["target/000001"].payload, TargetsMarked) == mark
+    with Journal(tmp_path / "journal.sqlite") as journal:
+        owner = own(journal)
+        kept = owner.given.read()
+        assert [it.id for it in kept.trajectories] == [first.id, second.id]
+        assert kept.marks == marked.marks
+        owner.given.keep(marked)  # the same again
+        others = [
+            Demonstrations((first, second)),
+            Demonstrations((first, second), (TargetsMarked(second.id, (2,)),)),
+            Demonstrations((second, first), marked.marks),
+            Demonstrations((first,)),
+        ]
+        before = journal.end_offset
+        for other in others:
+            with pytest.raises(
+                StorageError, match=r"expected the 2 .* and the same targets marked"
+            ):
+                owner.given.keep(other)
+        assert journal.end_offset == before
+
+
+def test_without_marks_nothing_is_marked(journal: Journal) -> None:
+    owner = own(journal)
+    owner.given.keep(Demonstrations((demonstration(0),)))
+    assert owner.given.read().marks is None
+    wrong = cropped(demonstration(1))
+    with pytest.raises(MessageError, match="actor and learner run different presets"):
+        own(journal).given.keep(Demonstrations((wrong,)))
+
+
+def demonstration(number: int) -> Trajectory:
+    ticket = Ticket(number, 0, 0, 0, 0, 3, 0.0)
+    return play(TicketReply(Instruction.COLLECT, "n", 1, ticket), number)
+
+
+def cropped(trajectory: Trajectory) -> Trajectory:
+    return dataclasses.replace(trajectory, observations=trajectory.observations[:, :36, :36])

@@ -15,8 +15,9 @@ from broker_config.preset import (
     SchedulePreset,
     TaskPreset,
 )
-from learner.cuda_graph import GraphedSteps
-from learner.gradient_steps import EagerSteps
+from learner.steps.compute import Compute
+from learner.steps.eager_steps import EagerSteps
+from learner.steps.graphed_steps import GraphedSteps
 from learner.teaching_signal import soft_value
 from learner.trainer import Trainer, TrainerState
 
@@ -285,7 +286,7 @@ def test_refuses_what_it_cannot_do() -> None:
 def test_the_program_of_the_cuda_graph_makes_the_same_steps(optimiser: str) -> None:
     """The program that a GPU records, run as it is on the CPU: bit for bit the eager steps."""
     preset = preset_with(optimiser__name=optimiser, schedule__epochs=10)
-    eager, graphed = Trainer(preset), Trainer(preset)
+    eager, graphed = (Trainer(preset, Compute(path="reference")) for _ in range(2))
     assert isinstance(eager._steps, EagerSteps)
     graphed._steps = GraphedSteps(
         graphed._network, graphed._optimiser, graphed._memory, record=run_twice_then_repeat

@@ -1,0 +1,1 @@
+"""Episodes in other formats: exported as NPZ and Minari datasets, imported from the latter."""

@@ -1,0 +1,222 @@
+"""What a page says of the rewards that discriminators learn: figure 4.7."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deploy.reproduce.experiment import Condition, Experiment
+from deploy.reproduce.kept_weights import kept_discriminators, kept_policy, policy_file
+from deploy.reproduce.reward_map_figure import RewardLine, draw_maps, draw_scores
+from deploy.reproduce.reward_maps import (
+    MapScore,
+    PoseGrid,
+    best_pose_degrees,
+    pose_grid,
+    reward_maps,
+    score_map,
+    write_scores,
+)
+from deploy.reproduce.runs import FinishedRun, RunPlan
+from deploy.reproduce.tables import mean_and_interval, table
+from deploy.reward_timeline import draw_timelines, play_greedily, score_steps
+
+MAPS: Final = "maps.png"
+MAP_SCORES: Final = "map_scores.png"
+NUMBERS: Final = "maps.jsonl"
+TIMELINE: Final = "timeline.png"
+NEAR_DEGREES: Final = 20.0
+"""A peak nearer than this to the best pose counts as near: four steps of the grid."""
+
+
+@dataclass(frozen=True)
+class MappedRun:
+    """A finished run, and what its discriminators rewarded."""
+
+    condition: Condition
+    plan: RunPlan
+    maps: tuple[dict[str, NDArray[np.float64]], ...]
+    """Of each iteration, from the first: see `reward_maps`."""
+
+    @property
+    def lines(self) -> list[RewardLine]:
+        """Its rewards: of all discriminators together, then of each of two."""
+        return [RewardLine(self.condition, part) for part in self.maps[0]]
+
+    def scores(self, grid: PoseGrid) -> list[MapScore]:
+        """Of all its maps."""
+        return [
+            score_map(self.plan, number, grid, part, rewards)
+            for number, maps in enumerate(self.maps, start=1)
+            for part, rewards in maps.items()
+        ]
+
+
+def map_rewards(
+    experiment: Experiment, runs: Sequence[FinishedRun], work: Path, folder: Path
+) -> list[str]:
+    """Draws and scores what the discriminators of all runs reward; returns the page's sections.
+
+    Args:
+        experiment: Reaching with two joints; each condition has discriminators.
+        runs: That are finished.
+        work: Folder in which the experiment keeps discriminators and policies.
+        folder: Of the page; pictures and numbers are written into it.
+
+    Raises:
+        StorageError: Discriminators are not there.
+        PresetError: The poses of the task are no plane.
+    """
+    plans = [
+        (condition, experiment.plan(panel, condition, seed))
+        for panel in experiment.panels
+        for condition in panel.conditions
+        for seed in panel.seed_numbers
+    ]
+    iterations = {run.key: run.iterations for run in runs}
+    finished = [(condition, plan) for condition, plan in plans if iterations.get(plan.key)]
+    if not finished:
+        return []
+    grid = pose_grid(finished[0][1].preset)
+    mapped = [
+        _mapped(condition, plan, iterations[plan.key], grid, work) for condition, plan in finished
+    ]
+    scores = [score for run in mapped for score in run.scores(grid)]
+    write_scores(folder / NUMBERS, scores)
+    first_seed = [run for run in mapped if run.plan.key.seed == mapped[0].plan.key.seed]
+    rows = {
+        line: [maps[line.part] for maps in run.maps] for run in first_seed for line in run.lines
+    }
+    of_first_seed = [score for score in scores if score.seed == mapped[0].plan.key.seed]
+    draw_maps(folder / MAPS, grid, rows, of_first_seed)
+    lines = list(dict.fromkeys(line for run in mapped for line in run.lines))
+    draw_scores(folder / MAP_SCORES, lines, scores)
+    sections = [_maps_section(lines, scores, grid), _peaks_section(lines, scores)]
+    with_policy = [run for run in mapped if policy_file(work, run.plan).exists()]
+    if with_policy:  # a run that is to go on has left none yet
+        sections.append(_timeline_section(folder, with_policy[0], work))
+    return sections
+
+
+def _mapped(
+    condition: Condition, plan: RunPlan, iterations: int, grid: PoseGrid, work: Path
+) -> MappedRun:
+    maps = tuple(
+        reward_maps(plan.preset, kept_discriminators(work, plan, iteration), grid)
+        for iteration in range(1, iterations + 1)
+    )
+    return MappedRun(condition, plan, maps)
+
+
+def _timeline_section(folder: Path, run: MappedRun, work: Path) -> str:
+    """The last policy's episode, under the discriminators of an early and of the last iteration."""
+    last = len(run.maps)
+    played = play_greedily(run.plan.preset, kept_policy(work, run.plan))
+    timelines = [
+        score_steps(
+            f"{run.condition.label}, discriminators of iteration {iteration}",
+            run.plan.preset,
+            kept_discriminators(work, run.plan, iteration),
+            played,
+        )
+        for iteration in dict.fromkeys((min(2, last), last))
+    ]
+    draw_timelines(folder / TIMELINE, timelines)
+    return "\n\n".join(
+        (
+            "### The rewards of one episode",
+            f"![Rewards over the steps of an episode, beside its pictures]({TIMELINE})",
+            f"What discriminators make of the state after each step: {run.condition.label}, seed "
+            f"{run.plan.key.seed}, the greedy episode of the policy after all "
+            f"{run.plan.preset.schedule.iterations} iterations.",
+        )
+    )
+
+
+def _maps_section(lines: Sequence[RewardLine], scores: Sequence[MapScore], grid: PoseGrid) -> str:
+    first, second = best_pose_degrees()
+    return "\n\n".join(
+        (
+            "## What discriminators reward",
+            f"![Reward maps, a row for each reward, a column for each iteration]({MAPS})",
+            "Rewards of seed 0 over both joint angles, for the discriminators that labelled each "
+            "iteration's samples; above each map its rank correlation (Spearman's) with the task's "
+            "reward. Every map has its own colours, dark where it is lowest. Red cross: the best "
+            f"pose, {first:.0f} and {second:.0f} degrees. Black ring: where the map is highest. "
+            "Left and below of the dashed line is what an episode can reach. Rewards are those of "
+            "eq. 4.3, without the bound that the generator's have.",
+            f"![Rank correlations and peaks over iterations]({MAP_SCORES})",
+            _correlation_table(lines, scores),
+            f"Poses: 0 to {grid.degrees[-1]:.0f} degrees in steps of "
+            f"{grid.degrees[1] - grid.degrees[0]:g}, each joint.",
+        )
+    )
+
+
+def _correlation_table(lines: Sequence[RewardLine], scores: Sequence[MapScore]) -> str:
+    header = ["reward", "seeds", "rank correlation, all iterations", "95 %", "last iteration"]
+    header += ["95 %", "reachable poses, all iterations", "95 %"]
+    rows = []
+    for line in lines:
+        seeds = line.seeds(scores)
+        rows.append(
+            [
+                line.label,
+                str(len(seeds)),
+                *_cells([np.mean([it.rank_correlation for it in seed]) for seed in seeds]),
+                *_cells([seed[-1].rank_correlation for seed in seeds]),
+                *_cells(
+                    [np.mean([it.reachable_rank_correlation for it in seed]) for seed in seeds]
+                ),
+            ]
+        )
+    return table(header, rows)
+
+
+def _cells(values: Sequence[float | np.floating]) -> list[str]:
+    return mean_and_interval([float(value) for value in values], "{:+.2f}")
+
+
+def _peaks_section(lines: Sequence[RewardLine], scores: Sequence[MapScore]) -> str:
+    n_iterations = max(score.iteration for score in scores)
+    header = ["reward", "seed", *(str(number + 1) for number in range(n_iterations))]
+    rows = []
+    for line in lines:
+        for seed in line.seeds(scores):
+            peaks = [f"{it.peak_degrees[0]:.0f}, {it.peak_degrees[1]:.0f}" for it in seed]
+            missing = [""] * (n_iterations - len(peaks))
+            rows.append([line.label, str(seed[0].seed), *peaks, *missing])
+    distances = ["reward", "mean distance", "95 %", "largest", f"within {NEAR_DEGREES:g} degrees"]
+    distances += ["the task's reward there", "95 %"]
+    summary = []
+    for line in lines:
+        seeds = line.seeds(scores)
+        errors = [float(np.mean([it.peak_error_degrees for it in seed])) for seed in seeds]
+        rewards = [float(np.mean([it.peak_reward for it in seed])) for seed in seeds]
+        every = [it.peak_error_degrees for seed in seeds for it in seed]
+        n_near = sum(error <= NEAR_DEGREES for error in every)
+        summary.append(
+            [
+                line.label,
+                *mean_and_interval(errors, "{:.0f}"),
+                f"{max(every):.0f}",
+                f"{n_near} of {len(every)}",
+                *mean_and_interval(rewards, "{:.2f}"),
+            ]
+        )
+    first, second = best_pose_degrees()
+    return "\n\n".join(
+        (
+            "### Where rewards are highest",
+            f"Distance from the best pose, {first:.0f} and {second:.0f} degrees, over all "
+            "iterations; the task's reward is 0 there and -1.68 upright.",
+            table(distances, summary),
+            "Both joint angles in degrees, iteration by iteration:",
+            table(header, rows),
+        )
+    )

@@ -1,0 +1,71 @@
+"""A layer's parameters as the matrices that products need, and the products themselves."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class WeightMatrix:
+    """A layer's weights as a matrix, and where their gradients go.
+
+    With bfloat16 they are rounded before each product, and the gradients' sums are float32.
+
+    Attributes:
+        rounded: What the products use, [O, I]: the weights times the scale of the inputs.
+        bias: [O].
+    """
+
+    def __init__(
+        self, layer: nn.Conv2d | nn.Linear, shape: tuple[int, ...], dtype: torch.dtype, scale: float
+    ) -> None:
+        assert layer.bias is not None
+        self._weight, self._bias = layer.weight, layer.bias
+        self._gradients = torch.zeros_like(layer.weight), torch.zeros_like(layer.bias)
+        self._shape = shape
+        self._scale = scale
+        is_exact = dtype == torch.float32 and scale == 1.0
+        self.rounded = self._matrix(self._weight) if is_exact else torch.empty(shape, dtype=dtype)
+        self.bias = self._bias.detach() if is_exact else torch.empty_like(self._bias, dtype=dtype)
+        self._is_exact = is_exact
+
+    def refresh(self) -> None:
+        """Follows the parameters, where the products do not read them directly."""
+        if not self._is_exact:
+            torch.mul(self._matrix(self._weight), self._scale, out=self.rounded)
+            self.bias.copy_(self._bias)
+
+    def set_gradients(self, output_gradients: Tensor, inputs: Tensor) -> None:
+        """Leaves the gradients at the parameters.
+
+        Args:
+            output_gradients: [n, O].
+            inputs: [n, I], before the scale.
+        """
+        weight, bias = self._gradients
+        matrix = self._matrix(weight)
+        if output_gradients.dtype == torch.float32:
+            torch.mm(output_gradients.t(), inputs, out=matrix)
+        else:
+            matrix.copy_(torch.mm(output_gradients.t(), inputs))
+        if self._scale != 1.0:
+            matrix.mul_(self._scale)
+        torch.sum(output_gradients, 0, dtype=torch.float32, out=bias)
+        self._weight.grad, self._bias.grad = weight, bias
+
+    def _matrix(self, weight: Tensor) -> Tensor:
+        """A weight as [O, I] in its own memory; of a convolution, I counts channels fastest."""
+        plain = weight.detach()
+        return (plain.permute(0, 2, 3, 1) if plain.dim() == 4 else plain).view(self._shape)
+
+
+def forward_with_relu(inputs: Tensor, weights: WeightMatrix, outputs: Tensor) -> None:
+    """max(0, x W' + b) of inputs [n, I], into outputs [n, O]."""
+    weights.refresh()
+    torch.addmm(weights.bias, inputs, weights.rounded.t(), out=outputs)
+    outputs.relu_()
+
+
+def pass_relu(gradients: Tensor, outputs: Tensor) -> None:
+    """Sets the gradients to 0 where the ReLU did."""
+    torch.ops.aten.threshold_backward.grad_input(gradients, outputs, 0.0, grad_input=gradients)

@@ -1,0 +1,237 @@
+"""The steps by matrix products against autograd, which defines what is correct."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from actors.networks import PreferenceNetwork, build_network
+from broker_config.errors import PresetError
+from broker_config.preset import OptimiserPreset, Preset
+from broker_config.specs import Head, NetworkSpec
+from deploy.presets import load_preset
+from learner.memory import LocalMemory
+from learner.steps.compute import Compute
+from learner.steps.eager_steps import EagerSteps, GradientSteps, preference_loss
+from learner.steps.optimiser import build_optimiser
+from learner.steps.patch_convolutions import PatchConvolutions
+from learner.steps.product_steps import Convolutions, ProductSteps
+from learner.steps.winograd import WinogradConvolutions
+from learner.trainer import Trainer
+
+N_ACTIONS, N_SAMPLES = 7, 24
+HEADS: tuple[Head, ...] = ("plain", "dueling-penalty", "dueling-exact", "dueling-mean")
+SHAPES = ((84, 84, 1), (36, 36, 3), (47, 61, 3))
+"""As in the source; the smallest; one where no stride divides anything."""
+Make = Callable[[PreferenceNetwork, int], Convolutions]
+IN_PATCHES: Make = partial(PatchConvolutions, dtype=torch.float32)
+IN_BFLOAT16: Make = partial(PatchConvolutions, dtype=torch.bfloat16)
+BATCH = torch.tensor([3, 0, 23, 11, 11])
+TARGETS = torch.randn(N_SAMPLES, generator=torch.Generator().manual_seed(1))
+
+
+def filled_memory(shape: tuple[int, int, int]) -> LocalMemory:
+    """A memory whose ring has wrapped."""
+    generator = np.random.default_rng(0)
+    memory = LocalMemory(N_SAMPLES, shape)
+    for _ in range(5):
+        length = 12
+        memory.add(
+            generator.integers(0, 256, (length + 1, *shape), np.uint8),
+            generator.integers(0, N_ACTIONS, length).astype(np.int32),
+            generator.normal(size=length).astype(np.float32),
+            terminated=False,
+        )
+    return memory
+
+
+def network_of(head: Head, shape: tuple[int, int, int]) -> PreferenceNetwork:
+    return build_network(NetworkSpec(shape, N_ACTIONS, head, 1.0), 3, starts_at_zero_value=True)
+
+
+class Recording:
+    """An optimiser that keeps the gradients, and changes nothing."""
+
+    def __init__(self, network: PreferenceNetwork) -> None:
+        self._network = network
+        self.gradients: dict[str, Tensor] = {}
+
+    def zero_grad(self) -> None:
+        self._network.zero_grad()
+
+    def step(self) -> None:
+        for name, parameter in self._network.named_parameters():
+            assert parameter.grad is not None
+            assert parameter.grad.stride() == parameter.stride()
+            self.gradients[name] = parameter.grad.clone()
+
+
+def gradients_by_products(
+    network: PreferenceNetwork,
+    memory: LocalMemory,
+    batch: Tensor,
+    targets: Tensor,
+    make_convolutions: Make,
+) -> tuple[dict[str, Tensor], float]:
+    optimiser = Recording(network)
+    steps = ProductSteps(network, optimiser, memory, make_convolutions)  # type: ignore[arg-type]
+    loss = steps.run(batch.unsqueeze(0), targets)
+    return optimiser.gradients, loss.item()
+
+
+def gradients_by_autograd(
+    network: PreferenceNetwork,
+    memory: LocalMemory,
+    batch: Tensor,
+    targets: Tensor,
+    *,
+    autocast: bool = False,
+) -> tuple[dict[str, Tensor], float]:
+    """In float64, so that what is left is the error of the products alone; or by torch's bf16."""
+    network = copy.deepcopy(network).to(torch.float32 if autocast else torch.float64)
+    pictures = memory.ring[memory.ring_positions[batch]].to(torch.float32)
+    if not autocast:
+        convolve = network.convolutions[0].forward
+        network.convolutions[0].forward = lambda x: convolve(x.double())  # type: ignore[method-assign]
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        loss = preference_loss(
+            network, pictures, memory.samples.actions[batch], targets[batch].double()
+        )
+    loss.backward()  # type: ignore[no-untyped-call]
+    gradients = {name: part.grad for name, part in network.named_parameters()}
+    return {name: each for name, each in gradients.items() if each is not None}, loss.item()
+
+
+def relative_error(got: Tensor, expected: Tensor) -> float:
+    return float((got - expected).norm() / expected.norm())
+
+
+@pytest.mark.parametrize(
+    ("make_convolutions", "most"),
+    [(IN_PATCHES, 2e-6), (WinogradConvolutions, 5e-6)],
+    ids=["patches", "winograd"],
+)
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("head", HEADS)
+def test_gradients_are_those_of_autograd(
+    head: Head, shape: tuple[int, int, int], make_convolutions: Make, most: float
+) -> None:
+    network, memory = network_of(head, shape), filled_memory(shape)
+    expected, expected_loss = gradients_by_autograd(network, memory, BATCH, TARGETS)
+    got, loss = gradients_by_products(network, memory, BATCH, TARGETS, make_convolutions)
+    assert loss == pytest.approx(expected_loss, rel=1e-5)
+    assert got.keys() == expected.keys()
+    for name, gradient in expected.items():
+        error = relative_error(got[name], gradient)
+        assert error < most, f"{name}: relative error {error:.2g}"
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("head", HEADS)
+def test_bfloat16_rounds_no_worse_than_mixed_precision_of_torch(
+    head: Head, shape: tuple[int, int, int]
+) -> None:
+    """Over all parameters: in a single layer, a unit at 0 may fall to either side."""
+    network, memory = network_of(head, shape), filled_memory(shape)
+    expected, _ = gradients_by_autograd(network, memory, BATCH, TARGETS)
+    by_torch, _ = gradients_by_autograd(network, memory, BATCH, TARGETS, autocast=True)
+    got, _ = gradients_by_products(network, memory, BATCH, TARGETS, IN_BFLOAT16)
+
+    def joined(gradients: dict[str, Tensor]) -> Tensor:
+        return torch.cat([gradients[name].flatten().double() for name in expected])
+
+    error = relative_error(joined(got), joined(expected))
+    assert error < 1.2 * relative_error(joined(by_torch), joined(expected))
+
+
+@pytest.mark.parametrize(
+    "make_convolutions", [IN_PATCHES, WinogradConvolutions], ids=["patches", "winograd"]
+)
+@pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
+def test_steps_follow_the_reference(optimiser: str, make_convolutions: Make) -> None:
+    """Many steps, with minibatches of two sizes: the same losses and weights up to rounding."""
+    preset = OptimiserPreset(optimiser, 2.5e-4, 1e-2)  # type: ignore[arg-type]
+    memory = filled_memory((36, 36, 1))
+    targets = torch.randn(N_SAMPLES, generator=torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(2)
+    batches = [torch.randint(N_SAMPLES, (10, size), generator=generator) for size in (8, 5)]
+    batches.append(batches[0])
+    networks, losses = [], []
+    for make in (EagerSteps, partial(ProductSteps, make_convolutions=make_convolutions)):
+        network = network_of("dueling-exact", (36, 36, 1))
+        steps: GradientSteps = make(network, build_optimiser(preset, network), memory)
+        losses.append(torch.cat([steps.run(rows, targets) for rows in batches]))
+        networks.append(network.state_dict())
+    torch.testing.assert_close(losses[1], losses[0], rtol=1e-4, atol=1e-5)
+    assert losses[0][-10:].mean() < losses[0][:10].mean()
+    for name, weights in networks[0].items():
+        torch.testing.assert_close(networks[1][name], weights, rtol=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize("n_pictures", [1, 64, 100])
+def test_preferences_are_those_of_the_network(n_pictures: int) -> None:
+    network, memory = network_of("dueling-penalty", (47, 61, 3)), filled_memory((47, 61, 3))
+    steps = ProductSteps(
+        network,
+        build_optimiser(OptimiserPreset("adam", 1e-3, 1e-8), network),
+        memory,
+        WinogradConvolutions,
+    )
+    generator = torch.Generator().manual_seed(4)
+    pictures = torch.randint(256, (n_pictures, 47, 61, 3), generator=generator, dtype=torch.uint8)
+    for _ in range(2):  # nothing of other pictures or weights is left
+        with torch.no_grad():
+            expected = network(pictures)
+        torch.testing.assert_close(steps.evaluate(pictures), expected, rtol=1e-4, atol=1e-5)
+        steps.run(BATCH.unsqueeze(0), TARGETS)
+
+
+def trained(compute: Compute) -> Trainer:
+    preset: Preset = load_preset("reaching-smoke", ["task.observation_shape=[36,36,1]"])
+    trainer = Trainer(preset, compute)
+    generator = np.random.default_rng(0)
+    for _ in range(2):
+        trainer.add(
+            generator.integers(0, 256, (11, 36, 36, 1), np.uint8),
+            generator.integers(0, preset.task.n_actions, 10).astype(np.int32),
+            generator.normal(size=10).astype(np.float32),
+            terminated=False,
+        )
+        trainer.update()
+    return trainer
+
+
+@pytest.mark.parametrize("path", ["winograd", "products-bf16"])
+def test_a_path_repeats_itself_bit_for_bit(path: str) -> None:
+    compute = Compute(path=path)  # type: ignore[arg-type]
+    first, second = trained(compute), trained(compute)
+    assert first.weights_bytes() == second.weights_bytes()
+    assert first.weights_bytes() != trained(Compute(path="reference")).weights_bytes()
+
+
+def test_a_path_goes_on_from_what_another_has_learned() -> None:
+    state = trained(Compute(path="reference")).get_state()
+    resumed = Trainer(
+        load_preset("reaching-smoke", ["task.observation_shape=[36,36,1]"]),
+        Compute(path="winograd"),
+    )
+    resumed.set_state(state)
+    resumed.update()
+    assert resumed.gradient_steps > state.counters["gradient_steps"]
+
+
+def test_paths_that_a_device_does_not_have_are_refused() -> None:
+    with pytest.raises(PresetError, match="expected winograd or reference or products-bf16 on cpu"):
+        Compute("cpu", "graphs")
+    with pytest.raises(PresetError, match="expected cpu or cuda; got tpu"):
+        Compute("tpu")
+    assert Compute("cuda:1").chosen_path == "graphs"
+    assert str(Compute()) == "winograd steps on cpu"
+    assert str(replace(Compute(), path="reference")) == "reference steps on cpu"
