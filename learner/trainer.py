@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from functools import partial
 
 import numpy as np
 import torch
@@ -31,7 +30,6 @@ from learner.steps.compute import ON_CPU, Compute, TrainingPath
 from learner.steps.eager_steps import EagerSteps, GradientSteps
 from learner.steps.graphed_steps import GraphedSteps, exact_float32
 from learner.steps.optimiser import FusedAdam, build_optimiser, named_state, overwrite
-from learner.steps.patch_convolutions import PatchConvolutions
 from learner.steps.product_steps import EVALUATED_AT_ONCE, ProductSteps
 from learner.teaching_signal import bellman_error
 
@@ -337,11 +335,13 @@ def _make_steps(
         case "reference":
             return EagerSteps(network, optimiser, memory), network
         case "products-bf16":
-            convolutions = partial(PatchConvolutions, dtype=torch.bfloat16)
+            # Here and below, not above: it imports numba, for which processes that make no steps
+            # need not wait.
+            from learner.steps.patch_convolutions import PatchConvolutions
+
             # Teaching signals are float32, and so is all that they are computed from.
-            return ProductSteps(network, optimiser, memory, convolutions), network
+            return ProductSteps(network, optimiser, memory, PatchConvolutions), network
         case "winograd":
-            # Not above: it imports numba, for which processes that make no steps need not wait.
             from learner.steps.winograd import WinogradConvolutions
 
             steps = ProductSteps(network, optimiser, memory, WinogradConvolutions)

@@ -7,6 +7,7 @@ from typing import Final
 
 from deploy.reproduce.experiment import AttentionFigure, Condition, Experiment, Panel
 from deploy.reproduce.tuning import TUNING_NOTES, tuning_panel
+from learner.steps.compute import TrainingPath
 
 _DPN = ("algorithm.method=dpn", "algorithm.head=plain")
 _DUELING_DPN = ("algorithm.method=dpn", "algorithm.head=dueling-penalty")
@@ -76,6 +77,12 @@ def _reaching_panels(n_joints: int, seeds: int) -> tuple[Panel, Panel]:
         Panel(f"{n_joints} joints", FOUR, seeds, overrides),
         Panel(f"{n_joints} joints, init", tuple(map(_initialised, FOUR)), seeds, overrides),
     )
+
+
+def _by_path(condition: Condition, path: TrainingPath, colour: str) -> Condition:
+    label = f"{condition.label}, {path}"
+    name = f"{condition.name}-{path}"
+    return replace(condition, name=name, label=label, colour=colour, path=path)
 
 
 _ETAS = (0.01, 0.1, 0.5, 1.5, 3.0, 10.0, 20.0)
@@ -171,6 +178,31 @@ CHAPTER_3: Final = (
         overrides=ADAM,
         panels=tuple(tuning_panel(method) for method in FOUR),
         notes=TUNING_NOTES,
+    ),
+    Experiment(
+        name="training-paths",
+        title="Training paths learn alike",
+        source="beside figure 3.5",
+        published="nothing: the source has one implementation.",
+        preset="reaching-ch3",
+        overrides=_TWO_EPOCHS,
+        panels=(
+            Panel(
+                "5 joints, DPN",
+                (
+                    _by_path(DPN, "reference", "C7"),
+                    _by_path(DPN, "winograd", "C0"),
+                    _by_path(DPN, "products-bf16", "C1"),
+                ),
+                seeds=5,
+            ),
+        ),
+        notes=(
+            *_TWO_EPOCHS_NOTES,
+            "A path changes the rounding of each step, and nothing else; but the first action that "
+            "comes out otherwise changes all that follows, so that the runs of one seed part, and "
+            "only what seeds have in common can be compared.",
+        ),
     ),
     Experiment(
         name="figure-3.9",

@@ -77,14 +77,15 @@ def reproduce(
     experiment = with_changes(found, seeds, settings, conditions, panels)
     plans, curves = list(experiment.plans()), folder / CURVES
     # Imported here: an episode is played there, and the command line needs no simulator.
-    from deploy.reproduce.stored_scores import score_last_policies
+    from deploy.reproduce.stored_scores import runs_to_repeat, score_last_policies
 
     if draw_only:
         runs = finished_runs(plans, curves, iterations)
     else:
         compute = Compute(device, training_path)
         sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
-        runs = finish_runs(plans, curves, work / name, compute, jobs, iterations)
+        anew = runs_to_repeat(experiment, folder / SCORES, work / name)
+        runs = finish_runs(plans, curves, work / name, compute, jobs, iterations, anew)
         score_last_policies(experiment, runs, folder / SCORES, work / name, jobs)
     draw(experiment, runs, folder, command, work / name)
 

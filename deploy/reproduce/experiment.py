@@ -11,6 +11,7 @@ from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import load_preset
 from deploy.reproduce.runs import RunKey, RunPlan, Start
+from learner.steps.compute import TrainingPath
 
 Measure = Literal["greedy_returns", "greedy_successes", "relative_bellman_errors"]
 
@@ -26,6 +27,8 @@ class Condition:
     overrides: tuple[str, ...]
     """Settings that replace the preset's."""
     start: Start = "untrained"
+    path: TrainingPath | None = None
+    """By which its learners make gradient steps; what the command asks for if None."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ class Experiment:
         needs_none = condition.start == "untrained" and preset.imitation is None
         rate = None if needs_none else self._mistake_rate_of(panel)
         key = RunKey(condition.name, seed, preset.digest, condition.start, rate, self.episodes)
-        return RunPlan(key, preset)
+        return RunPlan(key, preset, condition.path)
 
     def _mistake_rate_of(self, panel: Panel) -> float:
         return self.mistake_rate if panel.mistake_rate is None else panel.mistake_rate

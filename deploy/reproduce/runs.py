@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from broker_config.ownership import FileLock
 from broker_config.preset import Preset
 from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.reproduce.json_lines import read_lines, write_lines
-from learner.steps.compute import Compute
+from learner.steps.compute import Compute, TrainingPath
 
 ON_CLONING: Final = "autograd on cpu"
 """What clones are trained by, whatever learners are."""
@@ -58,6 +58,12 @@ class RunPlan:
 
     key: RunKey
     preset: Preset
+    path: TrainingPath | None = None
+    """By which its learner makes gradient steps, where that is what is compared."""
+
+    def compute(self, asked: Compute) -> Compute:
+        """What its learner computes on, where somebody has asked for this."""
+        return asked if self.path is None else replace(asked, path=self.path)
 
 
 @dataclass(frozen=True)
@@ -121,6 +127,7 @@ def finish_runs(
     compute: Compute,
     jobs: int,
     iterations: int | None,
+    anew: Set[RunKey] = frozenset(),
 ) -> list[FinishedRun]:
     """Makes what the file does not hold yet, and adds each run to it when it is finished.
 
@@ -133,6 +140,7 @@ def finish_runs(
         jobs: Runs at a time, each in a process of its own with one thread.
         iterations: How far each run is followed; the preset's if None. A run that was followed less
             far goes on.
+        anew: Runs that are made again though the file holds them whole.
 
     Returns:
         All runs asked for, in the order of `plans`.
@@ -149,9 +157,10 @@ def finish_runs(
         missing = []
         for plan in plans:
             kept = finished.get(plan.key)
-            if kept is None or kept.iterations < wanted[plan.key]:
+            lost = kept is not None and kept.iterations >= whole[plan.key] and plan.key in anew
+            if kept is None or kept.iterations < wanted[plan.key] or lost:
                 missing.append(plan)
-            elif kept.compute not in (str(compute), ON_CLONING):
+            elif kept.compute not in (str(plan.compute(compute)), ON_CLONING):
                 sys.stderr.write(f"{plan.key.name}: kept as it is, by {kept.compute}\n")
         errors: list[BaseException] = []
         for run in _run_side_by_side(missing, work, compute, jobs, wanted, errors):
@@ -210,7 +219,8 @@ def _run_side_by_side(
         jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
     ) as pool:
         futures = {
-            pool.submit(_run, plan, work, compute, wanted[plan.key]): plan.key for plan in plans
+            pool.submit(_run, plan, work, plan.compute(compute), wanted[plan.key]): plan.key
+            for plan in plans
         }
         try:
             for number, future in enumerate(as_completed(futures), start=1):

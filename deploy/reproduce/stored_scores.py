@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -18,6 +19,7 @@ from deploy.played_episodes import mapped
 from deploy.process import use_one_torch_thread
 from deploy.reproduce.experiment import Experiment, Panel
 from deploy.reproduce.json_lines import read_lines, write_lines
+from deploy.reproduce.kept_weights import policy_file
 from deploy.reproduce.runs import FinishedRun, RunKey, RunPlan, iterations_of
 
 
@@ -55,20 +57,43 @@ def score_last_policies(
     """
     ended = {run.key: run.iterations for run in runs}
     scores = read_scores(kept)
-    for source, plans in _plans_by_states(experiment).items():
-        states = states_of(source)
-        known = {score.run for score in scores if score.states_digest == states.digest}
-        missing = [
-            plan
-            for plan in plans
-            if plan.key not in known and ended.get(plan.key, -1) >= iterations_of(plan, None)
-        ]
+    for source, unscored in _unscored(experiment, scores).items():
+        plans = [it for it in unscored if ended.get(it.key, -1) >= iterations_of(it, None)]
         play = partial(_score, source, work)
-        for plan, made in zip(missing, mapped(play, missing, jobs), strict=True):
+        for plan, made in zip(plans, mapped(play, plans, jobs), strict=True):
             scores += made
             write_scores(kept, scores)
             portion = np.mean([success for score in made for success in score.successes])
             sys.stderr.write(f"{plan.key.name}: {portion:.0%} from the stored states {source}\n")
+
+
+def runs_to_repeat(experiment: Experiment, kept: Path, work: Path) -> set[RunKey]:
+    """Runs that have no scores yet and whose last policies are not in the work folder.
+
+    Curves and scores are small and travel; policies stay where they were made. Such runs are made
+    anew, or they could never be scored.
+
+    Args:
+        experiment: Whose runs.
+        kept: The file of scores.
+        work: Folder in which runs leave their last policies.
+
+    Raises:
+        PresetError: There are no such states.
+        StorageError: The file cannot be read.
+    """
+    plans = itertools.chain(*_unscored(experiment, read_scores(kept)).values())
+    return {plan.key for plan in plans if not policy_file(work, plan).exists()}
+
+
+def _unscored(experiment: Experiment, scores: list[StoredScore]) -> dict[str, list[RunPlan]]:
+    """What is still to be scored, by the name of the states."""
+    known = {(score.run, score.states_digest) for score in scores}
+    digests = {source: states_of(source).digest for source in _plans_by_states(experiment)}
+    return {
+        source: [plan for plan in plans if (plan.key, digests[source]) not in known]
+        for source, plans in _plans_by_states(experiment).items()
+    }
 
 
 def _plans_by_states(experiment: Experiment) -> dict[str, list[RunPlan]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 from broker_config.errors import PresetError, StorageError
@@ -14,10 +15,11 @@ TrainingPath = Literal["reference", "winograd", "products-bf16", "graphs"]
 float32."""
 
 _PATHS: dict[str, tuple[TrainingPath, ...]] = {
-    "cpu": ("winograd", "reference", "products-bf16"),
+    "cpu": ("winograd", "products-bf16", "reference"),
     "cuda": ("graphs", "reference"),
 }
-"""By type of device; the first is chosen where nothing else is asked for."""
+"""By type of device; the first is chosen where nothing else is asked for, but on a processor that
+multiplies numbers of bfloat16 it is `products-bf16`."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,13 @@ class Compute:
 
     @property
     def chosen_path(self) -> TrainingPath:
-        """The path, chosen if none is asked for."""
-        return self.path or _PATHS[self.device.partition(":")[0]][0]
+        """The path, chosen if none is asked for: by what the device can do, never by a timing."""
+        if self.path is not None:
+            return self.path
+        device_type = self.device.partition(":")[0]
+        if device_type == "cpu" and multiplies_bfloat16():
+            return "products-bf16"
+        return _PATHS[device_type][0]
 
     def as_begun(self, begun: str) -> Compute:
         """The same, by the path by which something was begun.
@@ -68,6 +75,19 @@ class Compute:
 
     def __str__(self) -> str:
         return f"{self.chosen_path} steps on {self.device}"
+
+
+@cache
+def multiplies_bfloat16() -> bool:
+    """Whether this processor has instructions for products of bfloat16, by vectors or by tiles."""
+    # Not torch, which knows as well: processes ask that do nothing else with it.
+    import llvmlite.binding
+
+    try:
+        features = llvmlite.binding.get_host_cpu_features()
+    except RuntimeError:  # LLVM knows nothing of this kind of processor
+        return False
+    return any(features.get(name, False) for name in ("avx512bf16", "amx-bf16"))
 
 
 ON_CPU = Compute()

@@ -1,39 +1,45 @@
-"""The network's convolutions as one matrix product forwards and two backwards each.
+"""The network's convolutions as one matrix product forwards and two backwards each, in bfloat16.
 
-The patches of a layer's inputs are the rows of a matrix. With bfloat16, on a processor that has
-products of it, nothing is faster; weights and activations are rounded before each product.
+The patches of a layer's inputs are the rows of a matrix. Weights and activations are rounded before
+each product. On a processor that has products of bfloat16 nothing is faster.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from actors.networks import PreferenceNetwork
+from learner.steps.patch_kernels import WORD, add_patches, take_patches
 from learner.steps.weight_matrix import WeightMatrix, forward_with_relu, pass_relu
 
 
 class PatchConvolutions:
     """All convolutions of a network, for minibatches of one size."""
 
-    def __init__(self, network: PreferenceNetwork, batch_size: int, dtype: torch.dtype) -> None:
+    def __init__(self, network: PreferenceNetwork, batch_size: int) -> None:
         """Allocates all that a step needs.
 
         Args:
             network: On the CPU, in the layout that `build_network` gives.
             batch_size: B.
-            dtype: Of the products, float32 or bfloat16.
         """
         height, width, channels = network.spec.observation_shape
-        self._pixels = torch.empty((batch_size, height, width, channels), dtype=dtype)
+        self._width = width
+        # Lines are whole words; no patch reaches what is added.
+        lines = torch.zeros((batch_size, height, -(-width // WORD) * WORD, channels))
+        self._pixels = lines.to(torch.bfloat16)
         self._convolutions: list[_Convolution] = []
-        inputs = self._pixels
+        inputs, size = self._pixels, (height, width)
         for number, layer in enumerate(network.convolutions):
             assert isinstance(layer, nn.Conv2d)
             # Whole numbers up to 255 are exact in bfloat16, 255ths of them are not.
             scale = 1.0 / 255.0 if number == 0 else 1.0
-            self._convolutions.append(_Convolution(layer, inputs, scale))
+            self._convolutions.append(_Convolution(layer, inputs, size, scale))
             inputs = self._convolutions[-1].outputs
+            size = (inputs.shape[1], inputs.shape[2])
 
     @property
     def maps(self) -> Tensor:
@@ -42,70 +48,75 @@ class PatchConvolutions:
 
     def forward(self, pictures: Tensor) -> None:
         """See `learner.steps.product_steps.Convolutions`."""
-        self._pixels.copy_(pictures)
+        self._pixels[:, :, : self._width].copy_(pictures)
         for convolution in self._convolutions:
             convolution.forward()
 
     def backward(self, gradients: Tensor) -> None:
         """See `learner.steps.product_steps.Convolutions`."""
-        self._convolutions[-1].gradients.copy_(gradients)
+        last = self._convolutions[-1]
+        last.gradients.copy_(gradients)
+        pass_relu(last.gradients, last.outputs)
         for convolution, below in zip(
-            reversed(self._convolutions), [*reversed(self._convolutions[:-1]), None], strict=True
+            self._convolutions[:0:-1], self._convolutions[-2::-1], strict=True
         ):
-            convolution.backward(None if below is None else below.gradients)
+            convolution.backward()
+            convolution.give_input_gradients(below.gradients)
+        self._convolutions[0].backward()
 
 
 class _Convolution:
     """A convolution without padding, and the ReLU after it.
 
     Attributes:
-        outputs: [B, h, w, O].
-        gradients: Of the loss by the outputs, the same shape.
+        outputs: bf16[B, h, w, O].
+        gradients: Of the loss by the sums that the ReLU was given, the same shape.
     """
 
-    def __init__(self, layer: nn.Conv2d, inputs: Tensor, scale: float) -> None:
-        batch_size, height, width, channels = inputs.shape
-        (kernel, _), (stride, _) = layer.kernel_size, layer.stride
-        rows, columns = (height - kernel) // stride + 1, (width - kernel) // stride + 1
-        line = width * channels
-        # A line of a patch is contiguous in a picture whose channels come last.
-        self._windows = inputs.as_strided(
-            (batch_size, rows, columns, kernel, kernel * channels),
-            (height * line, stride * line, stride * channels, line, 1),
-        )
-        n_outputs, n_inputs = layer.out_channels, kernel * kernel * channels
-        self._patches = inputs.new_empty((batch_size * rows * columns, n_inputs))
+    def __init__(
+        self, layer: nn.Conv2d, inputs: Tensor, size: tuple[int, int], scale: float
+    ) -> None:
+        channels = inputs.shape[-1]
+        self._kernel, self._stride = layer.kernel_size[0], layer.stride[0]
+        self._size = tuple((each - self._kernel) // self._stride + 1 for each in size)
+        self._inputs = inputs
+        self._step = self._stride * channels
+        assert self._step % WORD == 0, "a layer's strides times channels are whole words"
+        n_inputs = self._kernel * self._kernel * channels
+        maps = (len(inputs), *self._size, layer.out_channels)
+        self.outputs = inputs.new_empty(maps)
+        self.gradients = inputs.new_empty(maps)
+        self._patches = inputs.new_empty((self.outputs[..., 0].numel(), n_inputs))
         self._patch_gradients = torch.empty_like(self._patches)
-        self._weights = WeightMatrix(layer, (n_outputs, n_inputs), inputs.dtype, scale)
-        self.outputs = inputs.new_empty((batch_size, rows, columns, n_outputs))
-        self.gradients = torch.empty_like(self.outputs)
-        self._geometry = kernel, stride, line, channels
+        self._weights = WeightMatrix(layer, (layer.out_channels, n_inputs), inputs.dtype, scale)
 
     def forward(self) -> None:
-        self._patches.view(self._windows.shape).copy_(self._windows)
+        """Gives the outputs from the inputs."""
+        words = self._inputs.flatten(2).view(torch.int64).numpy()
+        steps = self._stride, self._step // WORD
+        patches = self._patches.view(torch.int64).numpy()
+        take_patches(words, self._size, self._kernel, steps, patches)
         forward_with_relu(self._patches, self._weights, self.outputs.view(len(self._patches), -1))
 
-    def backward(self, input_gradients: Tensor | None) -> None:
-        """Leaves the parameters' gradients, and those of the inputs where they are wanted."""
-        gradients = self.gradients.view(len(self._patches), -1)
-        pass_relu(gradients, self.outputs.view(gradients.shape))
-        self._weights.set_gradients(gradients, self._patches)
-        if input_gradients is not None:
-            torch.mm(gradients, self._weights.rounded, out=self._patch_gradients)
-            self._add_patches(input_gradients)
+    def backward(self) -> None:
+        """Leaves the parameters' gradients, given those of the outputs."""
+        self._weights.set_gradients(self._by_patch(self.gradients), self._patches)
 
-    def _add_patches(self, inputs: Tensor) -> None:
-        """Adds every patch's gradients to the inputs that it was taken from."""
-        kernel, stride, line, channels = self._geometry
-        batch_size, rows, columns, _ = self.outputs.shape
-        # Patches of neighbours are `stride` columns apart: so much of a line never overlaps.
-        run = stride * channels
-        parts = self._patch_gradients.view(batch_size, rows, columns, kernel, -1, run)
-        inputs.zero_()
-        for row in range(kernel):
-            for part in range(parts.shape[4]):
-                inputs.as_strided(
-                    (batch_size, rows, columns, run),
-                    (inputs.stride(0), stride * line, run, 1),
-                    row * line + part * run,
-                ).add_(parts[:, :, :, row, part])
+    def give_input_gradients(self, gradients: Tensor) -> None:
+        """Gives the gradients of the sums whose ReLU the inputs are, in their shape."""
+        torch.mm(self._by_patch(self.gradients), self._weights.rounded, out=self._patch_gradients)
+        add_patches(
+            _bits(self._patch_gradients),
+            self._size,
+            self._kernel,
+            (self._stride, self._step),
+            _bits(self._inputs.flatten(2)),
+            _bits(gradients.flatten(2)),
+        )
+
+    def _by_patch(self, maps: Tensor) -> Tensor:
+        return maps.view(len(self._patches), -1)
+
+
+def _bits(numbers: Tensor) -> NDArray[np.uint16]:
+    return numbers.view(torch.uint16).numpy()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from learner.steps.patch_kernels import sum_rows
+
 
 class WeightMatrix:
     """A layer's weights as a matrix, and where their gradients go.
@@ -28,11 +30,16 @@ class WeightMatrix:
         self.rounded = self._matrix(self._weight) if is_exact else torch.empty(shape, dtype=dtype)
         self.bias = self._bias.detach() if is_exact else torch.empty_like(self._bias, dtype=dtype)
         self._is_exact = is_exact
+        # Kept, since fresh pages of its size take longer than the product.
+        self._product = torch.empty_like(self.rounded)
 
     def refresh(self) -> None:
         """Follows the parameters, where the products do not read them directly."""
         if not self._is_exact:
-            torch.mul(self._matrix(self._weight), self._scale, out=self.rounded)
+            if self._scale == 1.0:
+                self.rounded.copy_(self._matrix(self._weight))  # several times as fast as `mul`
+            else:
+                torch.mul(self._matrix(self._weight), self._scale, out=self.rounded)
             self.bias.copy_(self._bias)
 
     def set_gradients(self, output_gradients: Tensor, inputs: Tensor) -> None:
@@ -46,11 +53,12 @@ class WeightMatrix:
         matrix = self._matrix(weight)
         if output_gradients.dtype == torch.float32:
             torch.mm(output_gradients.t(), inputs, out=matrix)
+            torch.sum(output_gradients, 0, out=bias)
         else:
-            matrix.copy_(torch.mm(output_gradients.t(), inputs))
+            matrix.copy_(torch.mm(output_gradients.t(), inputs, out=self._product))
+            sum_rows(output_gradients.view(torch.uint16).numpy(), bias.numpy())
         if self._scale != 1.0:
             matrix.mul_(self._scale)
-        torch.sum(output_gradients, 0, dtype=torch.float32, out=bias)
         self._weight.grad, self._bias.grad = weight, bias
 
     def _matrix(self, weight: Tensor) -> Tensor:

@@ -313,10 +313,21 @@ def test_two_commands_do_not_write_over_each_other(tmp_path: Path) -> None:
 
 
 def test_a_run_does_not_go_on_by_another_path(tmp_path: Path) -> None:
-    with InProcessRun(smoke_plan(), tmp_path) as begun:
+    with InProcessRun(smoke_plan(), tmp_path, Compute(path="winograd")) as begun:
         next(begun.finish())
     with pytest.raises(StorageError, match=r"go on by winograd steps on cpu.*got reference steps"):
         InProcessRun(smoke_plan(), tmp_path, Compute(path="reference"))
+
+
+def test_a_condition_may_say_by_which_path_it_learns(tmp_path: Path) -> None:
+    told = replace(DPN, path="reference")
+    plans = [smoke_plan(told, 0), smoke_plan(DPN, 1)]
+    asked = Compute(path="winograd")
+    finish_runs(plans, tmp_path / "c.jsonl", tmp_path / "work", asked, 1, iterations=1)
+    assert [run.compute for run in read_runs(tmp_path / "c.jsonl")] == [
+        "reference steps on cpu",
+        "winograd steps on cpu",
+    ]
 
 
 def test_demonstrations_to_imitate_show_enough_targets(tmp_path: Path) -> None:

@@ -107,6 +107,22 @@ def test_one_command_scores_last_policies_once(
     assert (tmp_path / "docs" / PAGE).read_text() == page
 
 
+def test_a_run_whose_policy_was_left_elsewhere_is_made_again_to_be_scored(
+    tmp_path: Path, few_states: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever clones the repository has curves and no policies."""
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "folding", folding_on(few_states))
+    docs, asked = tmp_path / "docs", {"conditions": ("cloning",)}
+    command.reproduce("folding", output=docs, work=tmp_path / "here", **asked)
+    curves, scores = read_runs(docs / CURVES), read_scores(docs / SCORES)
+    (docs / SCORES).unlink()
+    command.reproduce("folding", output=docs, work=tmp_path / "there", **asked)
+    assert read_scores(docs / SCORES) == scores
+    (again,), (first,) = read_runs(docs / CURVES), curves
+    assert (again.key, again.greedy_returns) == (first.key, first.greedy_returns)
+    assert (tmp_path / "there" / "folding" / "policies").is_dir()
+
+
 def test_only_runs_that_have_ended_are_scored(tmp_path: Path, few_states: Path) -> None:
     experiment = folding_on(few_states)
     plans = [experiment.plan(experiment.panels[0], condition, 0) for condition in (BID, CLONING)]
