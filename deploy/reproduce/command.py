@@ -110,13 +110,15 @@ def draw(
         StorageError: A figure needs weights that are not there.
     """
     # Imported here: the runs themselves need no matplotlib.
-    from deploy.reproduce.report import draw_figure, sort_runs, write_page
+    from deploy.reproduce.curves_figure import draw_curves
+    from deploy.reproduce.page import write_page
+    from deploy.reproduce.panel_runs import sort_runs
     from deploy.reproduce.reward_map_section import map_rewards
     from deploy.reproduce.stored_scores import read_scores
 
     folder.mkdir(parents=True, exist_ok=True)
     panels = sort_runs(experiment, runs, read_scores(folder / SCORES))
-    draw_figure(folder / FIGURE, experiment, panels)
+    draw_curves(folder / FIGURE, experiment.measures, panels)
     sections = map_rewards(experiment, runs, work, folder) if experiment.has_reward_maps else []
     write_page(folder / PAGE, experiment, panels, command, FIGURE, sections)
     sys.stderr.write(f"{folder / PAGE}: {len(runs)} runs\n")

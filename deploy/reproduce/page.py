@@ -1,25 +1,16 @@
-"""The figure and the page of an experiment."""
+"""The page of an experiment: what was published, what came out, and how it was made."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 
 from deploy.presets import load_preset
-from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
-from deploy.reproduce.runs import CLONED, FinishedRun, RunKey
-from deploy.reproduce.statistics import (
-    PairedDifference,
-    area_under_curve,
-    bootstrap_band,
-    interquartile_mean,
-    paired_difference,
-)
-from deploy.reproduce.stored_scores import StoredScore, states_of
+from deploy.reproduce.experiment import Experiment, Measure, Panel
+from deploy.reproduce.panel_runs import PanelRuns
+from deploy.reproduce.runs import FinishedRun
 from deploy.reproduce.stored_states_section import stored_states_section
 from deploy.reproduce.tables import (
     DIFFERENCE_HEADER,
@@ -28,150 +19,12 @@ from deploy.reproduce.tables import (
     table,
 )
 
-mpl.use("Agg")  # before pyplot: there is no screen
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
-
-_AXIS_LABELS: dict[Measure, str] = {
-    "greedy_returns": "return of the greedy policy",
-    "greedy_successes": "success at the end",
-    "relative_bellman_errors": "Bellman error / std(V)",
-}
 _AREA_OF: dict[Measure, str] = {
     "greedy_returns": "greedy return",
     "greedy_successes": "success of the greedy policy",
 }
-_PANEL_INCHES = (5.2, 3.4)
 _LEAST_SEEDS = 3
 """With fewer the page says which is ahead, and draws no conclusion."""
-
-
-@dataclass(frozen=True)
-class PanelRuns:
-    """A panel, and those of its runs that are finished."""
-
-    panel: Panel
-    runs: dict[str, list[FinishedRun]]
-    """By condition, in the order of seeds."""
-    measure: Measure = "greedy_returns"
-    """Under which areas are taken."""
-    scores: dict[str, list[StoredScore]] = field(default_factory=dict)
-    """Of last policies on the panel's stored states, by condition."""
-
-    @property
-    def subject(self) -> Condition:
-        """The condition that the others are compared with."""
-        return self.panel.conditions[0]
-
-    def areas(self, condition: Condition) -> dict[int, float]:
-        """Area under the curve of the measure, by seed."""
-        return {
-            run.key.seed: area_under_curve(run.samples, getattr(run, self.measure))
-            for run in self.runs[condition.name]
-        }
-
-    def difference(self, other: Condition) -> PairedDifference | None:
-        """The subject's areas minus the other's, over the seeds that both have finished."""
-        mine, theirs = self.areas(self.subject), self.areas(other)
-        seeds = sorted(mine.keys() & theirs.keys())
-        if not seeds:
-            return None
-        return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
-
-
-def sort_runs(
-    experiment: Experiment, runs: Sequence[FinishedRun], scores: Sequence[StoredScore] = ()
-) -> list[PanelRuns]:
-    """The finished runs and their scores, by panel and condition."""
-    by_key: dict[RunKey, FinishedRun] = {run.key: run for run in runs}
-    sorted_runs = []
-    for panel in experiment.panels:
-        keys = {
-            condition.name: [
-                experiment.plan(panel, condition, seed).key for seed in panel.seed_numbers
-            ]
-            for condition in panel.conditions
-        }
-        found = {name: [by_key[key] for key in its if key in by_key] for name, its in keys.items()}
-        scored: dict[str, list[StoredScore]] = {}
-        if panel.stored_states is not None:
-            digest = states_of(panel.stored_states).digest
-            on_these = [score for score in scores if score.states_digest == digest]
-            scored = {
-                name: [score for score in on_these if score.run in its]
-                for name, its in keys.items()
-            }
-        sorted_runs.append(PanelRuns(panel, found, experiment.measures[0], scored))
-    return sorted_runs
-
-
-def draw_figure(path: Path, experiment: Experiment, panels: Sequence[PanelRuns]) -> None:
-    """Draws each panel's curves over samples, a row for each measure, as a PNG."""
-    n_rows, n_columns = len(experiment.measures), len(panels)
-    width, height = _PANEL_INCHES
-    figure, grid = plt.subplots(
-        n_rows,
-        n_columns,
-        figsize=(width * n_columns, height * n_rows),
-        layout="constrained",
-        squeeze=False,
-        sharey="row",
-    )
-    for column, panel_runs in enumerate(panels):
-        for row, measure in enumerate(experiment.measures):
-            axes = grid[row][column]
-            _draw_panel(axes, panel_runs, measure)
-            axes.set(
-                title=panel_runs.panel.title if row == 0 else "",
-                xlabel="samples" if row == n_rows - 1 else "",
-                ylabel=_AXIS_LABELS[measure] if column == 0 else "",
-            )
-            axes.grid(alpha=0.3)
-            if row == 0:
-                axes.legend(fontsize=7)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
-    demonstrated: list[float] = []
-    for condition in panel_runs.panel.conditions:
-        runs = panel_runs.runs[condition.name]
-        if not runs:
-            continue
-        demonstrated += [
-            first.training_return
-            for run in runs
-            if (first := run.points[0]).iteration == 0 and first.training_return is not None
-        ]
-        samples, curves = _curves(runs, measure)
-        if not samples:
-            continue  # what was cloned has no value function
-        middle = interquartile_mean(curves)
-        low, high = bootstrap_band(curves)
-        label = f"{condition.label} ({len(runs)})"
-        if condition.start in CLONED:
-            axes.axhline(middle[0], color=condition.colour, linestyle=":", label=label)
-            axes.axhspan(low[0], high[0], color=condition.colour, alpha=0.1)
-            continue
-        style = "--" if condition.start == "initialised" else "-"
-        axes.plot(samples, middle, style, color=condition.colour, label=label, linewidth=1.5)
-        axes.fill_between(samples, low, high, color=condition.colour, alpha=0.15, linewidth=0)
-    if measure == "greedy_returns" and demonstrated:
-        axes.axhline(
-            float(np.mean(demonstrated)), color="purple", linestyle="-.", linewidth=1,
-            label="demonstrations",
-        )  # fmt: skip
-
-
-def _curves(runs: Sequence[FinishedRun], measure: Measure) -> tuple[list[int], np.ndarray]:
-    """Where the measure was taken, and its values f64[seeds, points]."""
-    if measure == "relative_bellman_errors":
-        points = [[it for it in run.points if it.iteration > 0] for run in runs]
-        values = [[it.relative_bellman_error or np.nan for it in each] for each in points]
-        return [it.samples for it in points[0]], np.array(values)
-    curves = [getattr(run, measure) for run in runs]
-    return runs[0].samples, np.array(curves, dtype=np.float64)
 
 
 def write_page(
@@ -200,8 +53,11 @@ def write_page(
         "in brackets the number of seeds. Every run's last policy counts, not its best.",
     ]
     for panel_runs in panels:
+        parts += [f"## {panel_runs.panel.title}"]
+        if not any(panel_runs.runs.values()):
+            parts += ["None of its runs is finished yet."]
+            continue
         parts += [
-            f"## {panel_runs.panel.title}",
             _panel_settings(panel_runs.panel),
             _conclusion(panel_runs),
             _scores_table(experiment, panel_runs),

@@ -1,0 +1,70 @@
+"""The finished runs of an experiment, sorted into its panels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
+from deploy.reproduce.runs import FinishedRun, RunKey
+from deploy.reproduce.statistics import PairedDifference, area_under_curve, paired_difference
+from deploy.reproduce.stored_scores import StoredScore, states_of
+
+
+@dataclass(frozen=True)
+class PanelRuns:
+    """A panel, and those of its runs that are finished."""
+
+    panel: Panel
+    runs: dict[str, list[FinishedRun]]
+    """By condition, in the order of seeds."""
+    measure: Measure = "greedy_returns"
+    """Under which areas are taken."""
+    scores: dict[str, list[StoredScore]] = field(default_factory=dict)
+    """Of last policies on the panel's stored states, by condition."""
+
+    @property
+    def subject(self) -> Condition:
+        """The condition that the others are compared with."""
+        return self.panel.conditions[0]
+
+    def areas(self, condition: Condition) -> dict[int, float]:
+        """Area under the curve of the measure, by seed."""
+        return {
+            run.key.seed: area_under_curve(run.samples, getattr(run, self.measure))
+            for run in self.runs[condition.name]
+        }
+
+    def difference(self, other: Condition) -> PairedDifference | None:
+        """The subject's areas minus the other's, over the seeds that both have finished."""
+        mine, theirs = self.areas(self.subject), self.areas(other)
+        seeds = sorted(mine.keys() & theirs.keys())
+        if not seeds:
+            return None
+        return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
+
+
+def sort_runs(
+    experiment: Experiment, runs: Sequence[FinishedRun], scores: Sequence[StoredScore] = ()
+) -> list[PanelRuns]:
+    """The finished runs and their scores, by panel and condition."""
+    by_key: dict[RunKey, FinishedRun] = {run.key: run for run in runs}
+    sorted_runs = []
+    for panel in experiment.panels:
+        keys = {
+            condition.name: [
+                experiment.plan(panel, condition, seed).key for seed in panel.seed_numbers
+            ]
+            for condition in panel.conditions
+        }
+        found = {name: [by_key[key] for key in its if key in by_key] for name, its in keys.items()}
+        scored: dict[str, list[StoredScore]] = {}
+        if panel.stored_states is not None:
+            digest = states_of(panel.stored_states).digest
+            on_these = [score for score in scores if score.states_digest == digest]
+            scored = {
+                name: [score for score in on_these if score.run in its]
+                for name, its in keys.items()
+            }
+        sorted_runs.append(PanelRuns(panel, found, experiment.measures[0], scored))
+    return sorted_runs
