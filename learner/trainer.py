@@ -30,7 +30,7 @@ from learner.steps.compute import ON_CPU, Compute, TrainingPath
 from learner.steps.eager_steps import EagerSteps, GradientSteps
 from learner.steps.graphed_steps import GraphedSteps, exact_float32
 from learner.steps.optimiser import FusedAdam, build_optimiser, named_state, overwrite
-from learner.steps.product_steps import EVALUATED_AT_ONCE, ProductSteps
+from learner.steps.product_steps import EVALUATED_AT_ONCE, ProductEvaluation, ProductSteps
 from learner.teaching_signal import bellman_error
 
 _EVALUATED_AT_ONCE = 2 * EVALUATED_AT_ONCE
@@ -334,15 +334,14 @@ def _make_steps(
             return GraphedSteps(network, optimiser, memory), network
         case "reference":
             return EagerSteps(network, optimiser, memory), network
-        case "products-bf16":
-            # Here and below, not above: it imports numba, for which processes that make no steps
-            # need not wait.
+        case "products-bf16" | "winograd":
+            # Not above: they import numba, for which processes that make no steps need not wait.
             from learner.steps.patch_convolutions import PatchConvolutions
-
-            # Teaching signals are float32, and so is all that they are computed from.
-            return ProductSteps(network, optimiser, memory, PatchConvolutions), network
-        case "winograd":
             from learner.steps.winograd import WinogradConvolutions
 
-            steps = ProductSteps(network, optimiser, memory, WinogradConvolutions)
-            return steps, steps.evaluate
+            convolutions = PatchConvolutions if path == "products-bf16" else WinogradConvolutions
+            # Teaching signals are float32, and so is all that they are computed from.
+            return (
+                ProductSteps(network, optimiser, memory, convolutions),
+                ProductEvaluation(network, WinogradConvolutions),
+            )

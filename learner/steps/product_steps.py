@@ -21,7 +21,7 @@ from learner.steps.optimiser import FusedAdam
 from learner.steps.weight_matrix import WeightMatrix, forward_with_relu, pass_relu
 
 EVALUATED_AT_ONCE = 64
-"""Pictures of which `ProductSteps.evaluate` computes preferences at a time."""
+"""Pictures of which `ProductEvaluation` computes preferences at a time."""
 
 
 class Convolutions(Protocol):
@@ -69,7 +69,6 @@ class ProductSteps:
         self._memory = memory
         self._make_convolutions = make_convolutions
         self._trunk: _Trunk | None = None
-        self._evaluating: _Trunk | None = None
 
     def run(self, batches: Tensor, targets: Tensor) -> Tensor:
         """See `GradientSteps.run`."""
@@ -89,25 +88,6 @@ class ProductSteps:
             self._optimiser.step()
         return losses
 
-    @torch.no_grad()
-    def evaluate(self, pictures: Tensor) -> Tensor:
-        """P(s, a) of any number of pictures, f32[n, A].
-
-        Args:
-            pictures: u8[n, H, W, C].
-        """
-        if self._evaluating is None:
-            convolutions = self._make_convolutions(self._network, EVALUATED_AT_ONCE)
-            self._evaluating = _Trunk(self._network, convolutions)
-        preferences = []
-        for part in torch.split(pictures, EVALUATED_AT_ONCE):
-            missing = EVALUATED_AT_ONCE - len(part)
-            full = (
-                torch.cat([part, part.new_zeros((missing, *part.shape[1:]))]) if missing else part
-            )
-            preferences.append(self._network.head(*self._evaluating.forward(full))[: len(part)])
-        return torch.cat(preferences)
-
     def _head_step(self, hidden: list[Tensor], actions: Tensor, targets: Tensor) -> Tensor:
         """The minibatch's loss; leaves gradients at the head's parameters and at its inputs."""
         preferences = self._network.head(*hidden)
@@ -115,6 +95,35 @@ class ProductSteps:
         loss = functional.mse_loss(chosen, targets)
         loss.backward()  # type: ignore[no-untyped-call]
         return loss.detach()
+
+
+class ProductEvaluation:
+    """Computes preferences by matrix products; equals the network up to rounding."""
+
+    def __init__(
+        self,
+        network: PreferenceNetwork,
+        make_convolutions: Callable[[PreferenceNetwork, int], Convolutions],
+    ) -> None:
+        """Prepares it; the arguments are those of `ProductSteps`."""
+        self._network = network
+        self._trunk = _Trunk(network, make_convolutions(network, EVALUATED_AT_ONCE))
+
+    @torch.no_grad()
+    def __call__(self, pictures: Tensor) -> Tensor:
+        """P(s, a) of any number of pictures, f32[n, A].
+
+        Args:
+            pictures: u8[n, H, W, C].
+        """
+        preferences = []
+        for part in torch.split(pictures, EVALUATED_AT_ONCE):
+            missing = EVALUATED_AT_ONCE - len(part)
+            full = (
+                torch.cat([part, part.new_zeros((missing, *part.shape[1:]))]) if missing else part
+            )
+            preferences.append(self._network.head(*self._trunk.forward(full))[: len(part)])
+        return torch.cat(preferences)
 
 
 class _Trunk:

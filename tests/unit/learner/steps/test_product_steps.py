@@ -23,7 +23,7 @@ from learner.steps.compute import Compute
 from learner.steps.eager_steps import EagerSteps, GradientSteps, preference_loss
 from learner.steps.optimiser import build_optimiser
 from learner.steps.patch_convolutions import PatchConvolutions
-from learner.steps.product_steps import Convolutions, ProductSteps
+from learner.steps.product_steps import Convolutions, ProductEvaluation, ProductSteps
 from learner.steps.winograd import WinogradConvolutions
 from learner.trainer import Trainer
 
@@ -180,12 +180,13 @@ def test_preferences_are_those_of_the_network(n_pictures: int) -> None:
         memory,
         WinogradConvolutions,
     )
+    evaluate = ProductEvaluation(network, WinogradConvolutions)
     generator = torch.Generator().manual_seed(4)
     pictures = torch.randint(256, (n_pictures, 47, 61, 3), generator=generator, dtype=torch.uint8)
     for _ in range(2):  # nothing of other pictures or weights is left
         with torch.no_grad():
             expected = network(pictures)
-        torch.testing.assert_close(steps.evaluate(pictures), expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(evaluate(pictures), expected, rtol=1e-4, atol=1e-5)
         steps.run(BATCH.unsqueeze(0), TARGETS)
 
 
