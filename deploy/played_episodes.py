@@ -6,6 +6,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -85,10 +86,20 @@ def sound_episode(index: int, play: Callable[[int], Trajectory]) -> Trajectory:
 
 
 def mapped(play: Callable[[T], R], chunks: list[T], jobs: int) -> Iterator[R]:
-    """What `play` makes of each chunk, in order, with so many processes."""
+    """What `play` makes of each chunk, in order, with so many processes.
+
+    Raises:
+        StorageError: A process was killed.
+    """
     if jobs == 1:
         yield from map(play, chunks)
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, context, end_with_parent, (os.getpid(),)) as pool:
-        yield from pool.map(play, chunks)
+        try:
+            yield from pool.map(play, chunks)
+        except BrokenProcessPool as error:
+            raise StorageError(
+                "episodes: expected processes that live; got one that was killed, perhaps for want "
+                "of memory; run the command again, with fewer of them"
+            ) from error

@@ -68,8 +68,8 @@ def clone(
         preset: Gives network, optimiser, minibatch size and seed.
         demonstrations: At least one.
         epochs: How often each sample is learned from.
-        augmentation: Pictures are shifted and of other colours as these discriminators see them;
-            with None they are learned from as they are.
+        augmentation: Pictures are shifted, turned and of other colours as these discriminators
+            see them; with None they are learned from as they are.
 
     Raises:
         MessageError: There are no demonstrations.

@@ -35,8 +35,8 @@ from learner.teaching_signal import bellman_error
 
 _EVALUATED_AT_ONCE = 2 * EVALUATED_AT_ONCE
 """Pictures for which preferences are computed at a time; a multiple of what steps take at once."""
-_STEPS_AT_ONCE = 256
-"""Gradient steps between two calls of `on_step`."""
+_STEPS_AT_ONCE = 32
+"""Gradient steps between two calls of `on_step`: seconds at most, even of large minibatches."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class Trainer:
             raise MessageError(
                 f"{self._preset.name}: expected an [initialisation] table; got none; add it"
             )
-        return self.update(self._preset.initialisation.target_switches)
+        return self._learn(self._preset.initialisation.target_switches, n_updates=0)
 
     def update(self, target_switches: int | None = None) -> UpdateReport:
         """UpdatePNetwork(N): N sub-problems, each against a frozen target network.
@@ -172,6 +172,12 @@ class Trainer:
             MessageError: The memory is empty, or N is less than 1.
         """
         N = self._preset.schedule.target_switches if target_switches is None else target_switches
+        report = self._learn(N, n_updates=self._counters.updates + 1)
+        self._counters.updates += 1
+        return report
+
+    def _learn(self, N: int, n_updates: int) -> UpdateReport:
+        """N sub-problems; values are then those of the policy that has had so many updates."""
         if N < 1:
             raise MessageError(f"target_switches: expected at least 1; got {N}")
         if len(self._memory) == self._memory.n_held:
@@ -179,13 +185,12 @@ class Trainer:
         began_secs = time.perf_counter()
         steps_before = self._counters.gradient_steps
         losses, errors = [], []
-        assessment = self._assess()
+        assessment = self._assess(n_updates)
         for _ in range(N):
             losses.append(self._solve_subproblem(assessment))
             targets = assessment.bellman_targets
-            assessment = self._assess()
+            assessment = self._assess(n_updates)
             errors.append(bellman_error(assessment.values, targets))
-        self._counters.updates += 1
         return UpdateReport(
             losses=tuple(loss.item() for loss in losses),
             gradient_steps=self._counters.gradient_steps - steps_before,
@@ -269,7 +274,8 @@ class Trainer:
         self._counters.gradient_steps += len(epochs)
         losses = []
         for batches in torch.split(epochs, _STEPS_AT_ONCE):
-            losses.append(self._steps.run(batches, teaching_signals))
+            with self._numerics():
+                losses.append(self._steps.run(batches, teaching_signals))
             self._on_step()
         return torch.cat(losses)
 
@@ -288,9 +294,11 @@ class Trainer:
         )
 
     @torch.no_grad()
-    def _assess(self) -> Assessment:
+    def _assess(self, n_updates: int | None = None) -> Assessment:
+        """Values of the policy that acts after so many updates; after the next one if None."""
+        epsilon = self._epsilon(n_updates)
         return assess(
-            self._preset.algorithm, self._memory.samples, self._evaluate_frames(), self._epsilon()
+            self._preset.algorithm, self._memory.samples, self._evaluate_frames(), epsilon
         )
 
     @torch.no_grad()
@@ -307,13 +315,16 @@ class Trainer:
         is_cuda = self._memory.device.type == "cuda"
         return exact_float32() if is_cuda else contextlib.nullcontext()
 
-    def _epsilon(self) -> float:
-        """Probability of a random action in the episode that acts on the updated network."""
+    def _epsilon(self, n_updates: int | None = None) -> float:
+        """Probability of a random action in the first episode after so many updates, or one more
+        than there were.
+        """
         exploration, schedule = self._preset.exploration, self._preset.schedule
         if exploration is None or not self._preset.algorithm.is_epsilon_greedy:
             return 0.0
         per_update = 1 if schedule.update_every == "episode" else schedule.episodes_per_iteration
-        return exploration.epsilon((self._counters.updates + 1) * per_update)
+        acting = self._counters.updates + 1 if n_updates is None else n_updates
+        return exploration.epsilon(acting * per_update)
 
 
 def _capacity(preset: Preset) -> int:

@@ -9,9 +9,10 @@ import numpy as np
 
 from deploy.attention import AttendedStep, attend
 from deploy.reproduce.experiment import AttentionFigure, Experiment
-from deploy.reproduce.kept_weights import kept_policy, policy_file
+from deploy.reproduce.kept_weights import kept_policy
 from deploy.reproduce.runs import RunPlan
 from deploy.reproduce.tables import mean_and_interval, table
+from deploy.reproduce.work_folder import policy_file
 
 AttendedRows = Sequence[tuple[str, list[AttendedStep]]]
 """Of each policy its label, and its steps."""
@@ -106,7 +107,7 @@ def write_attention_page(
         "Each policy's greedy episode from the run's first start. Above: the picture, the action "
         "chosen on it and its reward. Below: Grad-CAM of that action's preference on the last "
         "convolution, red where most speaks for it. Policies are the last ones of "
-        f"`{figure.experiment}`, seed {figure.seed}.\n\n"
+        f"`{figure.experiment}`, seed {min(rows_of_seeds)}.\n\n"
         f"{heat_table(rows_of_seeds)}\n\n"
         "Heat on cloth: the portion of Grad-CAM's heat that lies on cloth, mean over the steps "
         "shown on which anything speaks for the action; by chance it is the cloth's portion of the "

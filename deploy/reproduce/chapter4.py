@@ -55,9 +55,9 @@ _FLIPPING_NOTES = (
     "expert that looks ahead, with mistakes; at least three of the five have succeeded, and their "
     "last states are the targets.",
     "Adam instead of RMSProp; one target switch after K's 10 epochs. In the first panel what was "
-    "chosen for table 4.5: pictures are turned by up to 30 degrees for the discriminators, real and "
-    "generated alike, the discriminators have spectral norm, and the generator minibatches of 16. "
-    "In the second the two discriminators' rewards are brought to equal spread instead. "
+    "chosen for table 4.5: pictures are turned by up to 30 degrees for the discriminators, real "
+    "and generated alike, the discriminators have spectral norm, and the generator minibatches of "
+    "16. In the second the two discriminators' rewards are brought to equal spread instead. "
     "docs/imitation.md has what led there, on seeds that are not reported.",
 )
 _FLIPPING_SETTINGS = (

@@ -10,13 +10,14 @@ from typing import Annotated
 import tyro
 
 from broker_config.errors import PresetError
+from broker_config.ownership import FileLock
 from deploy.reproduce.experiment import (
     AttentionFigure,
     Experiment,
     TransferTable,
     with_changes,
 )
-from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs
+from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs, read_runs
 from learner.steps.compute import Compute, TrainingPath
 
 CURVES, SCORES, WORLDS = "curves.jsonl", "stored_states.jsonl", "worlds.jsonl"
@@ -76,18 +77,35 @@ def reproduce(
         return
     experiment = with_changes(found, seeds, settings, conditions, panels)
     plans, curves = list(experiment.plans()), folder / CURVES
-    # Imported here: an episode is played there, and the command line needs no simulator.
-    from deploy.reproduce.stored_scores import runs_to_repeat, score_last_policies
-
     if draw_only:
-        runs = finished_runs(plans, curves, iterations)
-    else:
-        compute = Compute(device, training_path)
-        sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
-        anew = runs_to_repeat(experiment, folder / SCORES, work / name)
-        runs = finish_runs(plans, curves, work / name, compute, jobs, iterations, anew)
-        score_last_policies(experiment, runs, folder / SCORES, work / name, jobs)
-    draw(experiment, runs, folder, command, work / name)
+        draw(experiment, finished_runs(plans, curves, iterations), folder, command, work / name)
+        return
+    compute = Compute(device, training_path)
+    sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
+    with FileLock(work / name / "reproduce.lock", f"experiment in {work / name}"):
+        runs = _make_runs(experiment, folder, work / name, compute, jobs, iterations)
+        draw(experiment, runs, folder, command, work / name)
+
+
+def _make_runs(
+    experiment: Experiment,
+    folder: Path,
+    work: Path,
+    compute: Compute,
+    jobs: int,
+    iterations: int | None,
+) -> list[FinishedRun]:
+    """Makes what the folder does not hold yet of an experiment's runs, and of their scores."""
+    # Imported here: an episode is played there, and the command line needs no simulator.
+    from deploy.reproduce.repeats import runs_to_repeat
+    from deploy.reproduce.stored_scores import read_scores, score_last_policies
+
+    curves, scores = folder / CURVES, folder / SCORES
+    anew = runs_to_repeat(experiment, read_runs(curves), read_scores(scores), work)
+    plans = list(experiment.plans())
+    runs = finish_runs(plans, curves, work, compute, jobs, iterations, anew)
+    score_last_policies(experiment, runs, scores, work, jobs)
+    return runs
 
 
 def draw(
@@ -140,9 +158,10 @@ def draw_attention_figure(figure: AttentionFigure, work: Path, folder: Path, com
 
     folder.mkdir(parents=True, exist_ok=True)
     experiment = find_experiment(figure.experiment)
-    seeds = {figure.seed, *seeds_with_policies(figure, experiment, work)}
-    rows_of_seeds = {seed: attended_rows(figure, experiment, work, seed) for seed in sorted(seeds)}
-    draw_attention(folder / ATTENTION, figure.title, rows_of_seeds[figure.seed])
+    # Where none has left all, the first says what is missing.
+    seeds = seeds_with_policies(figure, experiment, work) or [experiment.panels[0].first_seed]
+    rows_of_seeds = {seed: attended_rows(figure, experiment, work, seed) for seed in seeds}
+    draw_attention(folder / ATTENTION, figure.title, rows_of_seeds[seeds[0]])
     write_attention_page(folder / PAGE, figure, command, ATTENTION, rows_of_seeds)
     sys.stderr.write(f"{folder / PAGE}: policies of {len(seeds)} seeds\n")
 

@@ -104,7 +104,9 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
             continue  # what was cloned has no value function
         middle = interquartile_mean(curves)
         low, high = bootstrap_band(curves)
-        label = f"{condition.label} ({len(runs)})"
+        n_diverged = int((~np.isfinite(curves)).any(axis=1).sum())
+        diverged = f", {n_diverged} diverged" if n_diverged else ""
+        label = f"{condition.label} ({len(runs)}{diverged})"
         if condition.start in CLONED:
             axes.axhline(middle[0], color=condition.colour, linestyle=":", label=label)
             axes.axhspan(low[0], high[0], color=condition.colour, alpha=0.1)
@@ -123,7 +125,7 @@ def _curves(runs: Sequence[FinishedRun], measure: Measure) -> tuple[list[int], n
     """Where the measure was taken, and its values f64[seeds, points]."""
     if measure == "relative_bellman_errors":
         points = [[it for it in run.points if it.iteration > 0] for run in runs]
-        values = [[it.relative_bellman_error or np.nan for it in each] for each in points]
-        return [it.samples for it in points[0]], np.array(values)
+        values = [[it.relative_bellman_error for it in each] for each in points]
+        return [it.samples for it in points[0]], np.array(values, np.float64)  # None is nan
     curves = [getattr(run, measure) for run in runs]
     return runs[0].samples, np.array(curves, dtype=np.float64)

@@ -138,7 +138,6 @@ class AttentionFigure:
     conditions: tuple[str, ...]
     panels: tuple[str, ...] = ()
     """Titles of those whose policies are drawn; all if none is named."""
-    seed: int = 0
     steps: int = 4
 
 

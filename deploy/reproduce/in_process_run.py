@@ -26,8 +26,8 @@ from deploy.played_episodes import sound_episode
 from deploy.player import Player
 from deploy.relabelling import relabel
 from deploy.reproduce.demonstrations import demonstrations_of
-from deploy.reproduce.kept_weights import discriminators_file, policy_file
 from deploy.reproduce.runs import CLONED, CurvePoint, RunPlan, checkpoints_folder
+from deploy.reproduce.work_folder import discriminators_file, policy_file
 from discriminator.real_states import real_states
 from discriminator.trainer import Discriminators
 from learner.checkpoint import CheckpointStore

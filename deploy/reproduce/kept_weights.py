@@ -1,4 +1,4 @@
-"""What runs leave in their work folder: last policies, and the discriminators of each iteration."""
+"""Reads what runs have left in their work folder: policies and discriminators."""
 
 from __future__ import annotations
 
@@ -7,17 +7,8 @@ from pathlib import Path
 from actors.policy import Policy
 from broker_config.errors import StorageError
 from deploy.reproduce.runs import CLONED, RunPlan
+from deploy.reproduce.work_folder import discriminators_file, policy_file
 from learner.cloning import cloning_preset
-
-
-def policy_file(work: Path, plan: RunPlan) -> Path:
-    """Where a run's last policy is kept."""
-    return work / "policies" / f"{plan.key.name}.safetensors"
-
-
-def discriminators_file(work: Path, plan: RunPlan, iteration: int) -> Path:
-    """Where the discriminators are kept that labelled an iteration's samples last."""
-    return work / "discriminators" / plan.key.name / f"{iteration}.safetensors"
 
 
 def kept_policy(work: Path, plan: RunPlan) -> Policy:
@@ -46,5 +37,7 @@ def _read(path: Path, what: str) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise StorageError(
-            f"{path}: expected {what}; got {error}; run its experiment first, with the same --work"
+            f"{path}: expected {what}; got {error}; run its experiment with the same --work, and "
+            "with another --output than that which holds the curve already: weights stay where "
+            "they were made"
         ) from error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from deploy.presets import load_preset
 from deploy.reproduce.experiment import Experiment, Measure, Panel
 from deploy.reproduce.panel_runs import PanelRuns
-from deploy.reproduce.runs import FinishedRun
+from deploy.reproduce.runs import CLONED, FinishedRun
 from deploy.reproduce.stored_states_section import stored_states_section
 from deploy.reproduce.tables import (
     DIFFERENCE_HEADER,
@@ -80,23 +80,25 @@ def _panel_settings(panel: Panel) -> str:
 
 def _conclusion(panel_runs: PanelRuns) -> str:
     sentences = []
+    subject = panel_runs.subject.label
     for other in panel_runs.panel.conditions[1:]:
         difference = panel_runs.difference(other)
         if difference is None:
             continue
+        what = "last policy" if other.start in CLONED else "area under the curve"
         n_seeds = len(difference.differences)
-        if n_seeds < _LEAST_SEEDS:
+        if n_seeds < _LEAST_SEEDS or difference.t is None:
             sentences.append(
-                f"{panel_runs.subject.label}'s area under the curve minus {other.label}'s is "
-                f"{difference.mean:+.2f}, which with seeds as few as {n_seeds} tells nothing yet."
+                f"{subject}'s {what} minus {other.label}'s is {difference.mean:+.2f}, which with "
+                f"seeds as few as {n_seeds} tells nothing yet."
             )
             continue
-        low, high = difference.bootstrap
+        low, high = difference.t
         verdict = "above" if low > 0 else "below" if high < 0 else "not told apart from"
         sentences.append(
-            f"{panel_runs.subject.label}'s area under the curve is {verdict} {other.label}'s: the "
-            f"mean paired difference is {difference.mean:+.2f}, with a 95 % interval from "
-            f"{low:+.2f} to {high:+.2f} (bootstrap over {n_seeds} seeds)."
+            f"{subject}'s {what} is {verdict} {other.label}'s: the mean paired difference is "
+            f"{difference.mean:+.2f}, with a 95 % interval from {low:+.2f} to {high:+.2f} "
+            f"(Student's t, {n_seeds} seeds)."
         )
     return "\n".join(sentences)
 
@@ -118,7 +120,7 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
         minutes = np.mean([sum(it.secs for it in run.points) for run in runs]) / 60
         last = runs[0].points[-1]
         cells += [
-            f"{np.mean(list(panel_runs.areas(condition).values())):.2f}",
+            "" if condition.start in CLONED else f"{_mean(panel_runs.areas(condition)):.2f}",
             str(last.samples),
             str(last.gradient_steps),
             f"{minutes:.1f}",
@@ -127,13 +129,18 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
     return table(header, rows)
 
 
+def _mean(by_seed: Mapping[int, float]) -> float:
+    return float(np.mean(list(by_seed.values())))
+
+
 def _differences_table(panel_runs: PanelRuns) -> str:
-    rows = [
-        difference_row(f"{panel_runs.subject.label} - {other.label}", difference)
-        for other in panel_runs.panel.conditions[1:]
-        if (difference := panel_runs.difference(other)) is not None
-    ]
-    return table(["difference of areas", *DIFFERENCE_HEADER], rows) if rows else ""
+    rows = []
+    for other in panel_runs.panel.conditions[1:]:
+        if (difference := panel_runs.difference(other)) is not None:
+            what = ", last policies" if other.start in CLONED else ", areas"
+            label = f"{panel_runs.subject.label} - {other.label}{what}"
+            rows.append(difference_row(label, difference))
+    return table(["difference", *DIFFERENCE_HEADER], rows) if rows else ""
 
 
 def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
-from deploy.reproduce.runs import FinishedRun, RunKey
+from deploy.reproduce.runs import CLONED, FinishedRun, RunKey
 from deploy.reproduce.statistics import PairedDifference, area_under_curve, paired_difference
 from deploy.reproduce.stored_scores import StoredScore, states_of
 
@@ -35,9 +35,17 @@ class PanelRuns:
             for run in self.runs[condition.name]
         }
 
+    def last_values(self, condition: Condition) -> dict[int, float]:
+        """The measure of the last policy, by seed."""
+        return {run.key.seed: getattr(run, self.measure)[-1] for run in self.runs[condition.name]}
+
     def difference(self, other: Condition) -> PairedDifference | None:
-        """The subject's areas minus the other's, over the seeds that both have finished."""
-        mine, theirs = self.areas(self.subject), self.areas(other)
+        """The subject minus the other, over the seeds that both have finished.
+
+        Areas are compared; with what was cloned, which has no curve, the last policies.
+        """
+        values = self.last_values if other.start in CLONED else self.areas
+        mine, theirs = values(self.subject), values(other)
         seeds = sorted(mine.keys() & theirs.keys())
         if not seeds:
             return None

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deploy.reproduce.experiment import Condition, Experiment
-from deploy.reproduce.kept_weights import kept_discriminators, kept_policy, policy_file
+from deploy.reproduce.kept_weights import kept_discriminators, kept_policy
 from deploy.reproduce.reward_map_figure import RewardLine, draw_maps, draw_scores
 from deploy.reproduce.reward_maps import (
     MapScore,
@@ -24,6 +24,7 @@ from deploy.reproduce.reward_maps import (
 )
 from deploy.reproduce.runs import FinishedRun, RunPlan
 from deploy.reproduce.tables import mean_and_interval, table
+from deploy.reproduce.work_folder import policy_file
 from deploy.reward_timeline import draw_timelines, play_greedily, score_steps
 
 MAPS: Final = "maps.png"
@@ -144,9 +145,10 @@ def _maps_section(lines: Sequence[RewardLine], scores: Sequence[MapScore], grid:
         (
             "## What discriminators reward",
             f"![Reward maps, a row for each reward, a column for each iteration]({MAPS})",
-            "Rewards of seed 0 over both joint angles, for the discriminators that labelled each "
-            "iteration's samples; above each map its rank correlation (Spearman's) with the task's "
-            "reward. Every map has its own colours, dark where it is lowest. Red cross: the best "
+            f"Rewards of seed {min(it.seed for it in scores)} over both joint angles, for the "
+            "discriminators that labelled each iteration's samples; above each map its rank "
+            "correlation (Spearman's) with the task's reward. Every map has its own colours, dark "
+            "where it is lowest. Red cross: the best "
             f"pose, {first:.0f} and {second:.0f} degrees. Black ring: where the map is highest. "
             "Left and below of the dashed line is what an episode can reach. Rewards are those of "
             "eq. 4.3, without the bound that the generator's have.",

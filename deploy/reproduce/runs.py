@@ -10,11 +10,12 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence, Set
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from broker_config.ownership import FileLock
+from broker_config.errors import StorageError
 from broker_config.preset import Preset
 from deploy.process import end_with_parent, use_one_torch_thread
 from deploy.reproduce.json_lines import read_lines, write_lines
@@ -131,6 +132,8 @@ def finish_runs(
 ) -> list[FinishedRun]:
     """Makes what the file does not hold yet, and adds each run to it when it is finished.
 
+    Whoever calls it holds a lock on the work folder.
+
     Args:
         plans: The runs, in the order in which they are started.
         curves: The file of JSON lines, one for each iteration of a finished run.
@@ -140,35 +143,36 @@ def finish_runs(
         jobs: Runs at a time, each in a process of its own with one thread.
         iterations: How far each run is followed; the preset's if None. A run that was followed less
             far goes on.
-        anew: Runs that are made again though the file holds them whole.
+        anew: Runs that are made again though the file holds them, as far as it does.
 
     Returns:
         All runs asked for, in the order of `plans`.
 
     Raises:
-        AlreadyOwned: Another process makes runs in the work folder.
         ClothbusError: A run has failed; all others were finished before.
-        StorageError: The file cannot be read or written.
+        StorageError: The file cannot be read or written, or the process of a run was killed; what
+            was under way goes on next time.
     """
     wanted = {plan.key: iterations_of(plan, iterations) for plan in plans}
     whole = {plan.key: iterations_of(plan, None) for plan in plans}
-    with FileLock(work / "reproduce.lock", f"experiment in {work}"):
-        finished = {run.key: run for run in read_runs(curves)}
-        missing = []
-        for plan in plans:
-            kept = finished.get(plan.key)
-            lost = kept is not None and kept.iterations >= whole[plan.key] and plan.key in anew
-            if kept is None or kept.iterations < wanted[plan.key] or lost:
-                missing.append(plan)
-            elif kept.compute not in (str(plan.compute(compute)), ON_CLONING):
-                sys.stderr.write(f"{plan.key.name}: kept as it is, by {kept.compute}\n")
-        errors: list[BaseException] = []
-        for run in _run_side_by_side(missing, work, compute, jobs, wanted, errors):
-            finished[run.key] = run
-            write_runs(curves, finished.values())
-            # Only now: whatever ends this process before, the run goes on from its last iteration.
-            if run.iterations >= whole[run.key]:
-                shutil.rmtree(checkpoints_folder(work, run.key), ignore_errors=True)
+    finished = {run.key: run for run in read_runs(curves)}
+    followed = dict(wanted)
+    missing = []
+    for plan in plans:
+        kept = finished.get(plan.key)
+        if kept is not None and plan.key in anew:
+            followed[plan.key] = max(wanted[plan.key], kept.iterations)
+        if kept is None or kept.iterations < wanted[plan.key] or plan.key in anew:
+            missing.append(plan)
+        elif kept.compute not in (str(plan.compute(compute)), ON_CLONING):
+            sys.stderr.write(f"{plan.key.name}: kept as it is, by {kept.compute}\n")
+    errors: list[BaseException] = []
+    for run in _run_side_by_side(missing, work, compute, jobs, followed, errors):
+        finished[run.key] = run
+        write_runs(curves, finished.values())
+        # Only now: whatever ends this process before, the run goes on from its last iteration.
+        if run.iterations >= whole[run.key]:
+            shutil.rmtree(checkpoints_folder(work, run.key), ignore_errors=True)
     if errors:
         raise errors[0]
     return [_up_to(finished[plan.key], wanted[plan.key]) for plan in plans]
@@ -209,22 +213,31 @@ def _run_side_by_side(
     work: Path,
     compute: Compute,
     jobs: int,
-    wanted: dict[RunKey, int],
+    followed: dict[RunKey, int],
     errors: list[BaseException],
 ) -> Iterator[FinishedRun]:
-    """Yields each run when it is finished; a run that fails does not end the others."""
+    """Yields each run when it is finished; one that fails does not end the others.
+
+    Raises:
+        StorageError: A process was killed, which ends all of them.
+    """
     # A process for each run, and spawned: CUDA does not survive a fork.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         jobs, context, end_with_parent, (os.getpid(),), max_tasks_per_child=1
     ) as pool:
         futures = {
-            pool.submit(_run, plan, work, plan.compute(compute), wanted[plan.key]): plan.key
+            pool.submit(_run, plan, work, plan.compute(compute), followed[plan.key]): plan.key
             for plan in plans
         }
         try:
             for number, future in enumerate(as_completed(futures), start=1):
                 error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    raise StorageError(
+                        f"{work}: expected processes that live; got one that was killed, perhaps "
+                        "for want of memory; run the command again, it goes on from there"
+                    ) from error
                 ending = "finished" if error is None else f"failed: {error}"
                 name = futures[future].name
                 sys.stderr.write(f"{number} of {len(futures)} runs: {name} {ending}\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Iterable, Sequence
 from contextlib import closing
@@ -15,12 +14,13 @@ from numpy.typing import NDArray
 
 from actors.envs.stored_states import StoredStates, read_stored_states
 from broker_config.errors import PresetError
+from broker_config.structure import added
 from deploy.played_episodes import mapped
 from deploy.process import use_one_torch_thread
 from deploy.reproduce.experiment import Experiment, Panel
 from deploy.reproduce.json_lines import read_lines, write_lines
-from deploy.reproduce.kept_weights import policy_file
 from deploy.reproduce.runs import FinishedRun, RunKey, RunPlan, iterations_of
+from deploy.reproduce.work_folder import policy_digest, policy_file
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class StoredScore:
     """At the end of the episode from each state of that name, in the file's order."""
     returns: tuple[float, ...]
     """No discount."""
+    policy: str | None = added(None)
+    """SHA-256 of the policy's weights; None where it was not kept yet."""
 
 
 def score_last_policies(
@@ -57,43 +59,44 @@ def score_last_policies(
     """
     ended = {run.key: run.iterations for run in runs}
     scores = read_scores(kept)
-    for source, unscored in _unscored(experiment, scores).items():
-        plans = [it for it in unscored if ended.get(it.key, -1) >= iterations_of(it, None)]
+    for source, missing in unscored(experiment, scores, work).items():
+        plans = [it for it in missing if ended.get(it.key, -1) >= iterations_of(it, None)]
         play = partial(_score, source, work)
         for plan, made in zip(plans, mapped(play, plans, jobs), strict=True):
-            scores += made
+            place = plan.key, made[0].states_digest
+            scores = [it for it in scores if (it.run, it.states_digest) != place] + made
             write_scores(kept, scores)
             portion = np.mean([success for score in made for success in score.successes])
             sys.stderr.write(f"{plan.key.name}: {portion:.0%} from the stored states {source}\n")
 
 
-def runs_to_repeat(experiment: Experiment, kept: Path, work: Path) -> set[RunKey]:
-    """Runs that have no scores yet and whose last policies are not in the work folder.
-
-    Curves and scores are small and travel; policies stay where they were made. Such runs are made
-    anew, or they could never be scored.
+def unscored(
+    experiment: Experiment, scores: Iterable[StoredScore], work: Path
+) -> dict[str, list[RunPlan]]:
+    """Runs that are still to be scored, by the name of the states.
 
     Args:
         experiment: Whose runs.
-        kept: The file of scores.
-        work: Folder in which runs leave their last policies.
+        scores: That are known. Those of another policy than is there now do not count.
+        work: Folder in which runs have left their last policies.
 
     Raises:
         PresetError: There are no such states.
-        StorageError: The file cannot be read.
     """
-    plans = itertools.chain(*_unscored(experiment, read_scores(kept)).values())
-    return {plan.key for plan in plans if not policy_file(work, plan).exists()}
+    known = {(score.run, score.states_digest): score for score in scores}
+    missing = {}
+    for source, plans in _plans_by_states(experiment).items():
+        digest = states_of(source).digest
+        missing[source] = [
+            plan for plan in plans if not _is_current(known.get((plan.key, digest)), plan, work)
+        ]
+    return missing
 
 
-def _unscored(experiment: Experiment, scores: list[StoredScore]) -> dict[str, list[RunPlan]]:
-    """What is still to be scored, by the name of the states."""
-    known = {(score.run, score.states_digest) for score in scores}
-    digests = {source: states_of(source).digest for source in _plans_by_states(experiment)}
-    return {
-        source: [plan for plan in plans if (plan.key, digests[source]) not in known]
-        for source, plans in _plans_by_states(experiment).items()
-    }
+def _is_current(score: StoredScore | None, plan: RunPlan, work: Path) -> bool:
+    if score is None or score.policy is None:
+        return score is not None
+    return policy_digest(policy_file(work, plan)) in (None, score.policy)
 
 
 def _plans_by_states(experiment: Experiment) -> dict[str, list[RunPlan]]:
@@ -126,6 +129,7 @@ def _score(source: str, work: Path, plan: RunPlan) -> list[StoredScore]:
 
     use_one_torch_thread()
     states, policy = read_stored_states(source), kept_policy(work, plan)
+    digest = policy_digest(policy_file(work, plan))
     with closing(Player(plan.preset, source)) as player:
         episodes = [player.play(policy, 0, "greedy", n) for n in range(len(states.names))]
     return [
@@ -139,6 +143,7 @@ def _score(source: str, work: Path, plan: RunPlan) -> list[StoredScore]:
             tuple(
                 it.return_ for it, its in zip(episodes, states.names, strict=True) if its == name
             ),
+            digest,
         )
         for name in dict.fromkeys(states.names)
     ]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from deploy.reproduce.experiment import Condition, Panel
 from deploy.reproduce.statistics import hierarchical_interval, paired_difference
 from deploy.reproduce.stored_scores import StoredScore, successes_of
-from deploy.reproduce.tables import DIFFERENCE_HEADER, ONE_SEED, difference_row, table
+from deploy.reproduce.tables import ALL_AGREE, DIFFERENCE_HEADER, ONE_SEED, difference_row, table
 
 
 def stored_states_section(panel: Panel, scores: Mapping[str, Sequence[StoredScore]]) -> str:
@@ -45,6 +45,8 @@ def _success_table(scored: Mapping[Condition, Sequence[StoredScore]]) -> str:
 def _cell(successes: NDArray[np.float64]) -> str:
     low, high = hierarchical_interval(successes)
     spread = f"{low:.0%} to {high:.0%}" if len(successes) > 1 else ONE_SEED
+    if len(successes) > 1 and low == high:
+        spread = ALL_AGREE
     return f"{successes.mean():.0%} ({spread}), {successes.sum():.0f}/{successes.size}"
 
 

@@ -11,6 +11,8 @@ from deploy.reproduce.statistics import PairedDifference, bootstrap_interval
 
 ONE_SEED: Final = "needs two seeds"
 """In place of an interval."""
+ALL_AGREE: Final = "all agree"
+"""In place of an interval where resampling shows no spread, which proves none."""
 DIFFERENCE_HEADER: Final = ("each seed", "mean", "95 % bootstrap", "95 % Student's t")
 """Of the columns of `difference_row` after the first."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -24,8 +23,9 @@ from deploy.process import use_one_torch_thread
 from deploy.reproduce.catalogue import find_experiment
 from deploy.reproduce.experiment import KeptPolicies, TransferTable
 from deploy.reproduce.json_lines import read_lines, write_lines
-from deploy.reproduce.kept_weights import kept_policy, policy_file
+from deploy.reproduce.kept_weights import kept_policy
 from deploy.reproduce.runs import RunPlan
+from deploy.reproduce.work_folder import policy_digest, policy_file
 
 SCRIPT: Final = "the script"
 CHANCE: Final = "chance"
@@ -75,7 +75,7 @@ class _Planned:
         """Whether a score is one of this trial, by the policy that is there now."""
         if score is None:
             return False
-        return not self.can_be_played() or score.policy == _digest(self.weights)
+        return self.weights is None or policy_digest(self.weights) in (None, score.policy)
 
 
 def score_worlds(
@@ -199,11 +199,7 @@ def _play(work: Path, planned: _Planned) -> WorldScore:
         episodes = [player.play_by(acting, number) for number in range(trial.episodes)]
     return WorldScore(
         trial,
-        None if planned.weights is None else _digest(planned.weights),
+        None if planned.weights is None else policy_digest(planned.weights),
         tuple(it.success for it in episodes),
         tuple(it.return_ for it in episodes),
     )
-
-
-def _digest(path: Path | None) -> str | None:
-    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()

@@ -58,7 +58,7 @@ class EagerSteps:
     def run(self, batches: Tensor, targets: Tensor) -> Tensor:
         """See `GradientSteps.run`."""
         positions, actions = self._memory.ring_positions, self._memory.samples.actions
-        losses = torch.empty(len(batches))
+        losses = torch.empty(len(batches), device=self._memory.device)
         for step, batch in enumerate(batches):
             observations = self._memory.ring[positions[batch]]
             loss = preference_loss(self._network, observations, actions[batch], targets[batch])

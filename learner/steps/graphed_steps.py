@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import torch
@@ -142,7 +143,9 @@ class GraphedSteps:
         trained = [tensor for _, tensor in named_state(self._optimiser, self._network)]
         trained += self._network.parameters()
         before = [tensor.detach().clone() for tensor in trained]
-        with exact_float32():
+        # A stream belongs to a device, the current one where nothing is said.
+        on_device = torch.cuda.device(device) if device.type == "cuda" else nullcontext()
+        with on_device, exact_float32():
             programs = self._record(one_step), self._record(many_steps)
         with torch.no_grad():
             for tensor, value in zip(trained, before, strict=True):

@@ -91,7 +91,7 @@ def test_a_picture_is_what_was_seen(
     assert np.array_equal(shown, seen)
 
 
-@pytest.mark.parametrize("lasted_secs", [1e-4, 1e6])
+@pytest.mark.parametrize("lasted_secs", [1e-6, 1e6])
 def test_a_motion_ends_with_its_picture_and_took_no_longer_than_its_step(
     attach: Any, wait_until: Callable[..., None], lasted_secs: float
 ) -> None:

@@ -18,7 +18,7 @@ from deploy.reproduce.attention_figure import attended_rows, heat_table, seeds_w
 from deploy.reproduce.catalogue import ATTENTION_FIGURES, EXPERIMENTS, find_experiment
 from deploy.reproduce.chapter4 import ATTENTION_OF_CHAPTER_4
 from deploy.reproduce.experiment import Condition, Experiment, Panel
-from deploy.reproduce.kept_weights import policy_file
+from deploy.reproduce.work_folder import policy_file
 from learner.cloning import cloning_preset
 from learner.trainer import Trainer
 
@@ -48,7 +48,7 @@ def test_figures_are_of_policies_that_experiments_keep(tmp_path: Path) -> None:
         known = {condition.name for it in experiment.panels for condition in it.conditions}
         assert set(figure.conditions) <= known
         assert set(figure.panels) <= titles
-        with pytest.raises(StorageError, match="run its experiment first"):
+        with pytest.raises(StorageError, match="weights stay where they were made"):
             attended_rows(figure, experiment, tmp_path, seed=1)
         assert seeds_with_policies(figure, experiment, tmp_path) == []
 

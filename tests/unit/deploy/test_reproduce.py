@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,7 +35,6 @@ from deploy.reproduce.command import CURVES, FIGURE, PAGE, draw
 from deploy.reproduce.demonstrations import demonstrations_of
 from deploy.reproduce.experiment import Condition, Experiment, Panel, with_changes
 from deploy.reproduce.in_process_run import InProcessRun
-from deploy.reproduce.kept_weights import policy_file
 from deploy.reproduce.runs import (
     CurvePoint,
     FinishedRun,
@@ -44,6 +45,7 @@ from deploy.reproduce.runs import (
     read_runs,
     write_runs,
 )
+from deploy.reproduce.work_folder import policy_file
 from discriminator.real_states import real_states
 from learner.cloning import clone, cloning_preset
 from learner.steps.compute import ON_CPU, Compute
@@ -304,12 +306,43 @@ def test_a_run_that_fails_does_not_end_the_others(tmp_path: Path) -> None:
     assert not checkpoints_folder(tmp_path / "work", good.key).exists()
 
 
-def test_two_commands_do_not_write_over_each_other(tmp_path: Path) -> None:
+def test_two_commands_do_not_write_over_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from deploy.reproduce import catalogue
+
+    monkeypatch.setitem(catalogue.EXPERIMENTS, "smoke", SMOKE)
     with (
-        FileLock(tmp_path / "work" / "reproduce.lock", "another"),
+        FileLock(tmp_path / "work" / "smoke" / "reproduce.lock", "another"),
         pytest.raises(AlreadyOwned, match="experiment in"),
     ):
-        finish_runs([smoke_plan()], tmp_path / "c.jsonl", tmp_path / "work", ON_CPU, 1, None)
+        command.reproduce("smoke", output=tmp_path, work=tmp_path / "work")
+
+
+def test_a_run_that_is_made_again_does_not_become_shorter(tmp_path: Path) -> None:
+    plan, curves = smoke_plan(), tmp_path / "curves.jsonl"
+    (whole,) = finish_runs([plan], curves, tmp_path / "here", ON_CPU, 1, iterations=None)
+    arguments = (curves, tmp_path / "there", ON_CPU, 1, 1)
+    (start,) = finish_runs([plan], *arguments, anew={plan.key})
+    assert without_time(list(start.points)) == without_time(list(whole.points[:2]))
+    (kept,) = read_runs(curves)
+    assert without_time(list(kept.points)) == without_time(list(whole.points))
+    assert policy_file(tmp_path / "there", plan).exists()
+
+
+class EndsItsProcess(RunPlan):
+    """A plan whose process is gone as soon as it reads it, as if it had been killed."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os._exit, (1,)
+
+
+def test_a_process_that_is_killed_is_said(tmp_path: Path) -> None:
+    first, second = (smoke_plan(seed=seed) for seed in range(2))
+    plans = [EndsItsProcess(first.key, first.preset), second]
+    with pytest.raises(StorageError, match=r"got one that was killed.*run the command again"):
+        finish_runs(plans, tmp_path / "c.jsonl", tmp_path / "work", ON_CPU, 1, iterations=1)
+    finish_runs([first, second], tmp_path / "c.jsonl", tmp_path / "work", ON_CPU, 1, iterations=1)
 
 
 def test_a_run_does_not_go_on_by_another_path(tmp_path: Path) -> None:
@@ -360,7 +393,7 @@ def test_a_single_seed_tells_nothing_yet(tmp_path: Path) -> None:
     page = (tmp_path / PAGE).read_text()
     assert "minus DQN's is +1.00, which with seeds as few as 1 tells nothing yet." in page
     assert "is above" not in page
-    assert "| DPN - DQN | +1.00 | +1.00 | needs two seeds | needs two seeds |" in page
+    assert "| DPN - DQN, areas | +1.00 | +1.00 | needs two seeds | needs two seeds |" in page
     assert "| DPN | 1 | 2.00 | needs two seeds |" in page
 
 
@@ -465,7 +498,7 @@ def test_one_command_leaves_numbers_figure_and_page(
     assert (tmp_path / "docs" / FIGURE).stat().st_size > 5000
     page = (tmp_path / "docs" / PAGE).read_text()
     assert "clothbus reproduce smoke\n" in page
-    assert "| DPN - DQN |" in page
+    assert "| DPN - DQN, areas |" in page
     assert "**Published** (figure 0): It works." in page
     command.reproduce("smoke", draw_only=True, **places)
     assert (tmp_path / "docs" / PAGE).read_text() == page
@@ -482,7 +515,10 @@ def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
     draw(experiment, made, tmp_path, "the command")
     page = (tmp_path / PAGE).read_text()
     assert "DPN's area under the curve is above DQN's: the mean paired difference is +3.00" in page
-    assert "| DPN - DQN | +2.00, +4.00, +3.00 | +3.00 | +2.00 to +4.00 | +0.52 to +5.48 |" in page
+    assert (
+        "| DPN - DQN, areas | +2.00, +4.00, +3.00 | +3.00 | +2.00 to +4.00 | +0.52 to +5.48 |"
+        in page
+    )
     assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
 
 

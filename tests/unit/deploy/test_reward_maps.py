@@ -130,7 +130,7 @@ def test_each_iterations_discriminators_are_kept(made: tuple[Path, list[Finished
     with InProcessRun(PLAN, work) as resumed:  # it is finished: as its last checkpoint has it
         assert resumed._discriminators is not None
         assert resumed._discriminators.weights_bytes() == last
-    with pytest.raises(StorageError, match=r"in iteration 3; got .*run its experiment first"):
+    with pytest.raises(StorageError, match=r"in iteration 3; got .*weights stay where they were"):
         kept_discriminators(work, PLAN, 3)
 
 

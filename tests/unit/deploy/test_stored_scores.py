@@ -169,7 +169,7 @@ def test_trials_are_counted_seed_by_seed() -> None:
             "cloning": [replace(it, successes=(False,) * len(it.successes)) for it in scores],
         },
     )
-    assert "| flat | 75% (25% to 100%), 3/4 | 0% (0% to 0%), 0/4 |" in section
+    assert "| flat | 75% (25% to 100%), 3/4 | 0% (all agree), 0/4 |" in section
     assert "| creased | 50% (0% to 100%), 1/2 |" in section
     assert "| all | 67% (17% to 100%), 4/6 |" in section
     assert "| PGAIL-BiD - behaviour cloning | +0.33, +1.00 | +0.67 | +0.33 to +1.00 |" in section

@@ -93,10 +93,14 @@ def test_it_goes_on_bit_identically(episode: Callable[..., Trajectory]) -> None:
     assert resumed.weights_bytes() == trainer.weights_bytes()
 
 
-@pytest.mark.parametrize("path", ["winograd", "graphs"])
-def test_fast_paths_make_the_same_steps(path: str, episode: Callable[..., Trajectory]) -> None:
+@pytest.mark.parametrize(
+    ("path", "most"), [("winograd", 1e-3), ("graphs", 1e-3), ("products-bf16", 3e-2)]
+)
+def test_fast_paths_make_the_same_steps(
+    path: str, most: float, episode: Callable[..., Trajectory]
+) -> None:
     reference = begun(preset_with(), episode, path="reference")
-    other = begun(preset_with(), episode, path="winograd" if path == "winograd" else "reference")
+    other = begun(preset_with(), episode, path="reference" if path == "graphs" else path)
     if path == "graphs":
         steps = GraphedSteps(other._network, other._optimiser, other._memory, record=run_once)
         other._steps = steps
@@ -106,8 +110,8 @@ def test_fast_paths_make_the_same_steps(path: str, episode: Callable[..., Trajec
             trainer.update()
     assert other.gradient_steps == reference.gradient_steps
     for name, weights in reference.weights().items():
-        # One step's length: Adam follows the sign of gradients that are rounding alone.
-        torch.testing.assert_close(other.weights()[name], weights, atol=1e-3, rtol=1e-3)
+        # In float32 one step's length: Adam follows the sign of gradients that are rounding alone.
+        torch.testing.assert_close(other.weights()[name], weights, atol=most, rtol=1e-3)
 
 
 def run_once(program: Callable[[], None]) -> Callable[[], None]:
