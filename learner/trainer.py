@@ -316,9 +316,7 @@ class Trainer:
         return exact_float32() if is_cuda else contextlib.nullcontext()
 
     def _epsilon(self, n_updates: int | None = None) -> float:
-        """Probability of a random action in the first episode after so many updates, or one more
-        than there were.
-        """
+        """Probability of a random action after so many updates; after the next one if None."""
         exploration, schedule = self._preset.exploration, self._preset.schedule
         if exploration is None or not self._preset.algorithm.is_epsilon_greedy:
             return 0.0

@@ -18,13 +18,14 @@ from deploy.reproduce.reward_maps import (
     PoseGrid,
     best_pose_degrees,
     pose_grid,
+    read_scores,
     reward_maps,
     score_map,
     write_scores,
 )
 from deploy.reproduce.runs import FinishedRun, RunPlan
 from deploy.reproduce.tables import mean_and_interval, table
-from deploy.reproduce.work_folder import policy_file
+from deploy.reproduce.work_folder import discriminators_file, policy_file
 from deploy.reward_timeline import draw_timelines, play_greedily, score_steps
 
 MAPS: Final = "maps.png"
@@ -63,6 +64,9 @@ def map_rewards(
 ) -> list[str]:
     """Draws and scores what the discriminators of all runs reward; returns the page's sections.
 
+    Of runs that have left their discriminators elsewhere it takes the numbers that the folder
+    holds, and leaves the pictures as they are.
+
     Args:
         experiment: Reaching with two joints; each condition has discriminators.
         runs: That are finished.
@@ -70,38 +74,60 @@ def map_rewards(
         folder: Of the page; pictures and numbers are written into it.
 
     Raises:
-        StorageError: Discriminators are not there.
+        StorageError: There are neither discriminators nor numbers of a run.
         PresetError: The poses of the task are no plane.
     """
-    plans = [
+    iterations = {run.key: run.iterations for run in runs}
+    finished = [it for it in _plans(experiment) if iterations.get(it[1].key)]
+    if not finished:
+        return []
+    grid = pose_grid(finished[0][1].preset)
+    known = read_scores(folder / NUMBERS)
+    mapped: list[MappedRun] = []
+    scores: list[MapScore] = []
+    for condition, plan in finished:
+        last = iterations[plan.key]
+        its = [it for it in known if it.run == plan.key.name and it.iteration <= last]
+        is_known = any(it.iteration == last for it in its)
+        if not is_known or discriminators_file(work, plan, last).exists():
+            mapped.append(_mapped(condition, plan, last, grid, work))
+            its = mapped[-1].scores(grid)
+        scores += its
+    write_scores(folder / NUMBERS, scores)
+    lines = list(
+        dict.fromkeys(
+            RewardLine(condition, score.part)
+            for condition, plan in finished
+            for score in scores
+            if score.run == plan.key.name
+        )
+    )
+    first_seed = [it for it in scores if it.seed == scores[0].seed]
+    rows = {
+        line: [maps[line.part] for maps in run.maps]
+        for run in mapped
+        if run.plan.key.seed == scores[0].seed
+        for line in run.lines
+    }
+    if rows.keys() == set(lines):
+        draw_maps(folder / MAPS, grid, rows, first_seed)
+    draw_scores(folder / MAP_SCORES, lines, scores)
+    sections = [_maps_section(lines, scores, grid), _peaks_section(lines, scores)]
+    with_policy = [run for run in mapped if policy_file(work, run.plan).exists()]
+    if with_policy:  # a run that is to go on has left none yet
+        _draw_timeline(folder, with_policy[0], work)
+    if (folder / TIMELINE).exists():
+        sections.append(_timeline_section(*finished[0]))
+    return sections
+
+
+def _plans(experiment: Experiment) -> list[tuple[Condition, RunPlan]]:
+    return [
         (condition, experiment.plan(panel, condition, seed))
         for panel in experiment.panels
         for condition in panel.conditions
         for seed in panel.seed_numbers
     ]
-    iterations = {run.key: run.iterations for run in runs}
-    finished = [(condition, plan) for condition, plan in plans if iterations.get(plan.key)]
-    if not finished:
-        return []
-    grid = pose_grid(finished[0][1].preset)
-    mapped = [
-        _mapped(condition, plan, iterations[plan.key], grid, work) for condition, plan in finished
-    ]
-    scores = [score for run in mapped for score in run.scores(grid)]
-    write_scores(folder / NUMBERS, scores)
-    first_seed = [run for run in mapped if run.plan.key.seed == mapped[0].plan.key.seed]
-    rows = {
-        line: [maps[line.part] for maps in run.maps] for run in first_seed for line in run.lines
-    }
-    of_first_seed = [score for score in scores if score.seed == mapped[0].plan.key.seed]
-    draw_maps(folder / MAPS, grid, rows, of_first_seed)
-    lines = list(dict.fromkeys(line for run in mapped for line in run.lines))
-    draw_scores(folder / MAP_SCORES, lines, scores)
-    sections = [_maps_section(lines, scores, grid), _peaks_section(lines, scores)]
-    with_policy = [run for run in mapped if policy_file(work, run.plan).exists()]
-    if with_policy:  # a run that is to go on has left none yet
-        sections.append(_timeline_section(folder, with_policy[0], work))
-    return sections
 
 
 def _mapped(
@@ -114,7 +140,7 @@ def _mapped(
     return MappedRun(condition, plan, maps)
 
 
-def _timeline_section(folder: Path, run: MappedRun, work: Path) -> str:
+def _draw_timeline(folder: Path, run: MappedRun, work: Path) -> None:
     """The last policy's episode, under the discriminators of an early and of the last iteration."""
     last = len(run.maps)
     played = play_greedily(run.plan.preset, kept_policy(work, run.plan))
@@ -128,13 +154,16 @@ def _timeline_section(folder: Path, run: MappedRun, work: Path) -> str:
         for iteration in dict.fromkeys((min(2, last), last))
     ]
     draw_timelines(folder / TIMELINE, timelines)
+
+
+def _timeline_section(condition: Condition, plan: RunPlan) -> str:
     return "\n\n".join(
         (
             "### The rewards of one episode",
             f"![Rewards over the steps of an episode, beside its pictures]({TIMELINE})",
-            f"What discriminators make of the state after each step: {run.condition.label}, seed "
-            f"{run.plan.key.seed}, the greedy episode of the policy after all "
-            f"{run.plan.preset.schedule.iterations} iterations.",
+            f"What discriminators make of the state after each step: {condition.label}, seed "
+            f"{plan.key.seed}, the greedy episode of the policy after all "
+            f"{plan.preset.schedule.iterations} iterations.",
         )
     )
 

@@ -5,10 +5,9 @@ Source: figure 4.7.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Final, cast
@@ -20,9 +19,9 @@ from numpy.typing import NDArray
 from actors.envs.planar_arm import INCREMENTS_RAD, TARGET_M, end_effector_m, reaching_reward
 from actors.envs.reaching import observe_arm
 from actors.envs.reaching_picture import Colour
-from broker_config.durable import write_durably
 from broker_config.errors import PresetError
 from broker_config.preset import Preset
+from deploy.reproduce.json_lines import read_lines, write_lines
 from deploy.reproduce.runs import RunPlan
 from deploy.reproduce.statistics import rank_correlation
 from discriminator.rewards import discriminator_reward
@@ -166,7 +165,19 @@ def score_map(
     )
 
 
+def read_scores(path: Path) -> list[MapScore]:
+    """Reads what `write_scores` wrote; no scores where there is no file.
+
+    Raises:
+        StorageError: The file holds something else.
+    """
+    return read_lines(path, MapScore, "scores of reward maps")
+
+
 def write_scores(path: Path, scores: Iterable[MapScore]) -> None:
-    """One line of JSON for each."""
-    lines = (json.dumps(asdict(score)) for score in scores)
-    write_durably(path, "".join(f"{line}\n" for line in lines).encode())
+    """Writes the scores; a reader sees the whole file or none.
+
+    Raises:
+        StorageError: The disk refuses.
+    """
+    write_lines(path, scores)

@@ -34,7 +34,7 @@ CLONED: Final[tuple[Start, ...]] = ("cloned", "cloned-augmented")
 
 @dataclass(frozen=True)
 class RunKey:
-    """Names one run of an experiment by everything that determines it."""
+    """Names one run of an experiment by all that determines it, but for its training path."""
 
     condition: str
     seed: int

@@ -168,5 +168,21 @@ def test_the_page_has_maps_scores_and_a_timeline(
     peak = rows[2]["peak_degrees"]
     assert f"| PGAIL-BiD: D_T alone | 0 | {peak[0]:.0f}, {peak[1]:.0f} |" in page
     assert map_rewards(MAPPED, [], work, tmp_path) == []
-    shutil.copytree(work / "discriminators", tmp_path / "discriminators")
-    assert len(map_rewards(MAPPED, runs, tmp_path, tmp_path)) == 2  # no policy, and no timeline
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(work / "discriminators", elsewhere / "discriminators")
+    assert len(map_rewards(MAPPED, runs, elsewhere, elsewhere)) == 2  # no policy, and no timeline
+
+
+def test_a_page_is_drawn_from_numbers_where_weights_were_left_elsewhere(
+    made: tuple[Path, list[FinishedRun]], tmp_path: Path
+) -> None:
+    work, runs = made
+    docs, nowhere = tmp_path / "docs", tmp_path / "nowhere"
+    draw(MAPPED, runs, docs, "the command", work)
+    left = {path.name: path.read_bytes() for path in docs.iterdir()}
+    draw(MAPPED, runs, docs, "the command", nowhere)
+    assert {path.name: path.read_bytes() for path in docs.iterdir()} == left
+    numbers = docs / NUMBERS
+    numbers.write_text("".join(numbers.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(StorageError, match=r"expected the discriminators of pgail-0-.*iteration 1"):
+        draw(MAPPED, runs, docs, "the command", nowhere)
