@@ -13,7 +13,7 @@ from broker_config.errors import PresetError, StorageError
 from deploy.reproduce import catalogue, command, stored_scores
 from deploy.reproduce.chapter4 import BID, CLONING
 from deploy.reproduce.command import CURVES, PAGE, SCORES
-from deploy.reproduce.experiment import Experiment, Panel
+from deploy.reproduce.experiment import Experiment, Panel, with_changes
 from deploy.reproduce.runs import finish_runs, read_runs
 from deploy.reproduce.stored_scores import (
     StoredScore,
@@ -23,6 +23,7 @@ from deploy.reproduce.stored_scores import (
     write_scores,
 )
 from deploy.reproduce.stored_states_section import stored_states_section
+from deploy.reproduce.work_folder import policy_file
 from learner.steps.compute import ON_CPU
 
 torch.set_num_threads(1)  # as the runs' own processes have
@@ -129,6 +130,25 @@ def test_only_runs_that_have_ended_are_scored(tmp_path: Path, few_states: Path) 
     runs = finish_runs(plans, tmp_path / CURVES, tmp_path, ON_CPU, 1, iterations=0)
     score_last_policies(experiment, runs, tmp_path / SCORES, tmp_path, 1)
     assert {it.run.condition for it in read_scores(tmp_path / SCORES)} == {"cloning"}
+
+
+def test_a_policy_that_has_changed_is_scored_again(tmp_path: Path, few_states: Path) -> None:
+    experiment = with_changes(folding_on(few_states), seeds=2)
+    plans = [experiment.plan(experiment.panels[0], CLONING, seed) for seed in range(2)]
+    runs = finish_runs(plans, tmp_path / CURVES, tmp_path, ON_CPU, 1, None)
+
+    def digests() -> list[str | None]:
+        score_last_policies(experiment, runs, tmp_path / SCORES, tmp_path, 1)
+        scores = [it for it in read_scores(tmp_path / SCORES) if it.initial_state == "flat"]
+        assert [it.run for it in scores] == [plan.key for plan in plans]
+        return [it.policy for it in scores]
+
+    first, other = digests()
+    assert digests() == [first, other], "nothing has changed"
+    policy_file(tmp_path, plans[0]).write_bytes(policy_file(tmp_path, plans[1]).read_bytes())
+    assert digests() == [other, other]
+    policy_file(tmp_path, plans[0]).unlink()
+    assert digests() == [other, other], "it is known"
 
 
 def test_a_policy_that_is_gone_is_named(tmp_path: Path, few_states: Path) -> None:
