@@ -94,7 +94,7 @@ def test_it_goes_on_bit_identically(episode: Callable[..., Trajectory]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "most"), [("winograd", 1e-3), ("graphs", 1e-3), ("products-bf16", 3e-2)]
+    ("path", "most"), [("winograd", 0.02), ("graphs", 0.02), ("products-bf16", 0.8)]
 )
 def test_fast_paths_make_the_same_steps(
     path: str, most: float, episode: Callable[..., Trajectory]
@@ -104,14 +104,17 @@ def test_fast_paths_make_the_same_steps(
     if path == "graphs":
         steps = GraphedSteps(other._network, other._optimiser, other._memory, record=run_once)
         other._steps = steps
+    before = reference.weights()
     for seed in range(4):  # its own part of the ring wraps
         for trainer in (reference, other):
             add_own(trainer, episode(seed, 5))
             trainer.update()
     assert other.gradient_steps == reference.gradient_steps
     for name, weights in reference.weights().items():
-        # In float32 one step's length: Adam follows the sign of gradients that are rounding alone.
-        torch.testing.assert_close(other.weights()[name], weights, atol=most, rtol=1e-3)
+        # Adam follows the sign of gradients, also of those that are rounding alone; what has
+        # nothing in common would be at 1.4.
+        error = (other.weights()[name] - weights).norm() / (weights - before[name]).norm()
+        assert error < most, f"{name}: relative error of what was learned {error:.2g}"
 
 
 def run_once(program: Callable[[], None]) -> Callable[[], None]:

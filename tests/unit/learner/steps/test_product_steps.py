@@ -144,12 +144,14 @@ def test_bfloat16_rounds_no_worse_than_mixed_precision_of_torch(
 
 
 @pytest.mark.parametrize(
-    ("make_convolutions", "most"),
-    [(PatchConvolutions, 2e-2), (WinogradConvolutions, 1e-5)],
+    ("make_convolutions", "most_of_loss", "most_of_learned"),
+    [(PatchConvolutions, 5e-2, 0.5), (WinogradConvolutions, 1e-5, 1e-4)],
     ids=["bfloat16", "winograd"],
 )
 @pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
-def test_steps_follow_the_reference(optimiser: str, make_convolutions: Make, most: float) -> None:
+def test_steps_follow_the_reference(
+    optimiser: str, make_convolutions: Make, most_of_loss: float, most_of_learned: float
+) -> None:
     """Many steps, with minibatches of two sizes: the same losses up to rounding."""
     preset = OptimiserPreset(optimiser, 2.5e-4, 1e-2)  # type: ignore[arg-type]
     memory = filled_memory((36, 36, 1))
@@ -163,12 +165,12 @@ def test_steps_follow_the_reference(optimiser: str, make_convolutions: Make, mos
         steps: GradientSteps = make(network, build_optimiser(preset, network), memory)
         losses.append(torch.cat([steps.run(rows, targets) for rows in batches]))
         networks.append(network.state_dict())
-    torch.testing.assert_close(losses[1], losses[0], rtol=most, atol=1e-5)
+    torch.testing.assert_close(losses[1], losses[0], rtol=most_of_loss, atol=1e-5)
     assert losses[0][-10:].mean() < losses[0][:10].mean()
     before = network_of("dueling-exact", (36, 36, 1)).state_dict()
     for name, weights in networks[0].items():
         error = relative_error(networks[1][name] - before[name], weights - before[name])
-        assert error < 10 * most, f"{name}: relative error of what was learned {error:.2g}"
+        assert error < most_of_learned, f"{name}: relative error of what was learned {error:.2g}"
 
 
 @pytest.mark.parametrize("n_pictures", [1, 64, 100])
