@@ -14,17 +14,17 @@ from broker_config.errors import ClothbusError, PresetError, RouterUnreachable
 from broker_config.heart import HUNG_SECS
 from broker_config.messages import Command
 from broker_config.session import DEFAULT_ADDRESS
-from deploy import (
-    demonstration_commands,
-    export_command,
-    offline_commands,
-    policy_commands,
-    recording_commands,
-    reward_commands,
-    role_commands,
-    task_commands,
+from deploy.commands import (
+    demonstrations,
+    export,
+    offline,
+    policies,
+    recordings,
+    rewards,
+    roles,
+    tasks,
 )
-from deploy.option_rules import (
+from deploy.commands.option_rules import (
     Settings,
     refuse_unknown_task,
     require_patience,
@@ -91,10 +91,10 @@ def run(
         record: Record the run as MCAP into its folder; a run in one process is not recorded.
         zenoh: Zenoh settings, each key/path=value.
     """
-    from deploy.kept_compute import settle_compute
     from deploy.presets import load_preset
-    from deploy.run import RunOptions, run_over_bus
     from deploy.run_folder import RunFolder, create_run_folder, require_acting
+    from deploy.running.kept_compute import settle_compute
+    from deploy.running.run import RunOptions, run_over_bus
 
     require_positive("actors", actors)
     require_patience(hung_secs)
@@ -123,7 +123,7 @@ def run(
     )
     carry_out = run_over_bus
     if in_process:
-        from deploy.run_in_process import run_in_process
+        from deploy.running.run_in_process import run_in_process
 
         carry_out = run_in_process
     if not carry_out(folder, chosen, options, Console()):
@@ -153,7 +153,7 @@ def status(
         run: The run's name; not needed when the router carries one run.
         zenoh: Zenoh settings, each key/path=value.
     """
-    from deploy.status import read_status, status_table
+    from deploy.commands.status import read_status, status_table
 
     address = router_address(connect)
     name = run or _only_run(address, zenoh)
@@ -179,7 +179,7 @@ def control(
         process: The actor to drain, the recorder to forget; all of them if not given.
         zenoh: Zenoh settings, each key/path=value.
     """
-    from deploy.status import send_control
+    from deploy.commands.status import send_control
 
     address = router_address(connect)
     name = run or _only_run(address, zenoh)
@@ -211,9 +211,13 @@ def evaluate(
             with clothbus.
         initial_states: Which of them; all if none is given.
     """
-    from deploy.evaluate import evaluate as evaluate_versions
-    from deploy.evaluate import evaluate_on_stored_states, score_table, stored_score_table
-    from deploy.evaluation import modes_of
+    from deploy.evaluation.evaluate import evaluate as evaluate_versions
+    from deploy.evaluation.evaluate import (
+        evaluate_on_stored_states,
+        score_table,
+        stored_score_table,
+    )
+    from deploy.evaluation.scores import modes_of
     from deploy.run_folder import RunFolder
 
     if episodes is not None:
@@ -236,30 +240,28 @@ def evaluate(
     Console().print(table)
 
 
-app.command(name="router")(role_commands.router)
-app.command(name="learner")(role_commands.learner)
-app.command(name="actor")(role_commands.actor)
-app.command(name="discriminator")(role_commands.discriminator)
-app.command(name="record")(role_commands.record)
-app.command(name="evaluator")(role_commands.evaluator)
-app.command(
-    demonstration_commands.app, name="demos", help="Make, import, show and label demonstrations."
-)
-app.command(reward_commands.app, name="rewards", help="Check and draw discriminators' rewards.")
-app.command(name="task")(task_commands.task)
-app.command(name="reach")(task_commands.reach)
-app.command(name="watch")(task_commands.watch)
-app.command(name="spread")(task_commands.spread)
-app.command(name="states")(task_commands.states)
-app.command(name="train")(offline_commands.train)
-app.command(name="replay")(offline_commands.replay)
-app.command(name="export")(export_command.export)
+app.command(name="router")(roles.router)
+app.command(name="learner")(roles.learner)
+app.command(name="actor")(roles.actor)
+app.command(name="discriminator")(roles.discriminator)
+app.command(name="record")(roles.record)
+app.command(name="evaluator")(roles.evaluator)
+app.command(demonstrations.app, name="demos", help="Make, import, show and label demonstrations.")
+app.command(rewards.app, name="rewards", help="Check and draw discriminators' rewards.")
+app.command(name="task")(tasks.task)
+app.command(name="reach")(tasks.reach)
+app.command(name="watch")(tasks.watch)
+app.command(name="spread")(tasks.spread)
+app.command(name="states")(tasks.states)
+app.command(name="train")(offline.train)
+app.command(name="replay")(offline.replay)
+app.command(name="export")(export.export)
 app.command(name="reproduce")(reproduce)
-app.command(name="attention")(policy_commands.attention)
-app.command(name="info")(recording_commands.info)
-app.command(name="check")(recording_commands.check)
-app.command(name="recover")(recording_commands.recover)
-app.command(name="slice")(recording_commands.slice_recording)
+app.command(name="attention")(policies.attention)
+app.command(name="info")(recordings.info)
+app.command(name="check")(recordings.check)
+app.command(name="recover")(recordings.recover)
+app.command(name="slice")(recordings.slice_recording)
 app.command(name="report")(report)
 
 
@@ -272,7 +274,7 @@ def _require_evaluable(episodes: int, in_process: bool) -> None:
 
 
 def _only_run(address: str, zenoh: tuple[str, ...]) -> str:
-    from deploy.status import only_run
+    from deploy.commands.status import only_run
 
     return only_run(address, zenoh)
 

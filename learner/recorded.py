@@ -28,8 +28,8 @@ from broker_config.messages import (
     TrajectoryId,
     Verdict,
 )
-from broker_config.recording import iter_recording
-from broker_config.recording_format import journal_topic, segment_paths
+from broker_config.recording.format import journal_topic, segment_paths
+from broker_config.recording.recording import iter_recording
 
 DEMONSTRATOR_PREFIX = "demonstrator/"
 TRAJECTORY_PREFIX = "trajectory/"

@@ -31,7 +31,7 @@ from broker_config.messages import (
     weights_digest,
 )
 from broker_config.preset import Preset
-from broker_config.recording import Recording
+from broker_config.recording.recording import Recording
 from learner.tickets import make_ticket
 
 Heard = JournalEntry | Snapshot | View | Metrics | Presence

@@ -33,7 +33,7 @@ from broker_config.messages import (
 from broker_config.preset import Preset, TaskPreset
 from broker_config.structure import from_plain
 from broker_config.version import VERSION
-from deploy.demonstration_folder import DemonstrationWriter
+from deploy.demonstrations.folder import DemonstrationWriter
 from deploy.exchange.facts import IMPORTED_ACTOR, TrajectoryFacts
 from deploy.exchange.minari_format import (
     DATA_FILE,

@@ -16,8 +16,8 @@ from broker_config.messages import (
     TrajectoryId,
 )
 from broker_config.preset import Preset, preset_from_json
-from broker_config.recording_format import segment_paths
-from deploy.recorded_episodes import RecordedRun, journal_entries, source_paths
+from broker_config.recording.format import segment_paths
+from deploy.offline.recorded_episodes import RecordedRun, journal_entries, source_paths
 from learner.recorded import DEMONSTRATOR_PREFIX, TRAJECTORY_PREFIX
 
 OnEntry = Callable[[], None]

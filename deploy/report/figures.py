@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import NDArray
 
-from deploy.evaluation import Mode, Score
+from deploy.evaluation.scores import Mode, Score
 from deploy.report.composition import RewardedIteration
 from deploy.report.lives import Life
 from deploy.report.record import Iteration, RunRecord

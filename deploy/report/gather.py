@@ -24,8 +24,8 @@ from broker_config.messages import (
     Verdict,
 )
 from broker_config.preset import Preset
-from broker_config.recording import RecordedMessage
-from deploy.evaluation import Score
+from broker_config.recording.recording import RecordedMessage
+from deploy.evaluation.scores import Score
 from deploy.report.attempts import AttemptLog
 from deploy.report.composition import CompositionLog
 from deploy.report.episodes import EpisodeLog, Episodes

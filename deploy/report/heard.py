@@ -8,7 +8,7 @@ from typing import Final
 
 from broker_config.messages import Metrics, Presence, RecorderStarted, RecordingGap
 from broker_config.preset import Preset
-from deploy.evaluation import Mode, Score, modes_of
+from deploy.evaluation.scores import Mode, Score, modes_of
 from deploy.report.lives import LifeBook
 from deploy.report.record import Recorded
 

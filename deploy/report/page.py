@@ -13,7 +13,7 @@ import numpy as np
 from actors.policy import Policy
 from broker_config.errors import StorageError
 from broker_config.messages import Rewards
-from deploy.evaluation import modes_of
+from deploy.evaluation.scores import modes_of
 from deploy.report import tables
 from deploy.report.composition import reward_parts
 from deploy.report.figures import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from broker_config.messages import Command, Rewards, Verdict
 from broker_config.preset import Preset
-from deploy.evaluation import Score
+from deploy.evaluation.scores import Score
 from deploy.report.attempts import ActorTally, WrongAttempt
 from deploy.report.composition import RewardedIteration
 from deploy.report.episodes import Episodes, ShownEpisode

@@ -13,8 +13,7 @@ from broker_config.errors import StorageError
 from broker_config.journal import JournalReader
 from broker_config.messages import JournalEntry, RunStarted, Snapshot
 from broker_config.preset import Preset, preset_from_json
-from broker_config.recording import RecordedMessage
-from broker_config.recording_format import (
+from broker_config.recording.format import (
     GAP_TOPIC,
     MESSAGE_ENCODING,
     PRESENCE_TOPIC,
@@ -23,8 +22,9 @@ from broker_config.recording_format import (
     journal_topic,
     segment_paths,
 )
-from broker_config.recording_scan import iter_whole
-from deploy.evaluation import Score, read_results, scores_of
+from broker_config.recording.recording import RecordedMessage
+from broker_config.recording.scan import iter_whole
+from deploy.evaluation.scores import Score, read_results, scores_of
 from deploy.run_folder import RunFolder
 from learner.snapshots import SnapshotStore
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from broker_config.messages import Command, Verdict
-from deploy.evaluation import Score
+from deploy.evaluation.scores import Score
 from deploy.report.composition import RewardedIteration
 from deploy.report.figures import DISCRIMINATOR_NAMES
 from deploy.report.record import Iteration, RunRecord

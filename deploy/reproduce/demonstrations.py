@@ -9,8 +9,8 @@ from pathlib import Path
 from broker_config.errors import StorageError
 from broker_config.messages import Trajectory
 from broker_config.preset import ImitationPreset
-from deploy.demonstrators import by_script
-from deploy.make_demonstrations import (
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import (
     LEAST_TARGETS,
     MOST_DRAWS,
     make_demonstrations,

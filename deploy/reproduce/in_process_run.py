@@ -22,12 +22,12 @@ from broker_config.errors import PresetError, StorageError
 from broker_config.messages import Trajectory, TrajectoryId
 from broker_config.preset import DiscriminatorPreset
 from broker_config.structure import from_plain, to_plain
-from deploy.played_episodes import sound_episode
-from deploy.player import Player
-from deploy.relabelling import relabel
+from deploy.evaluation.played_episodes import sound_episode
+from deploy.evaluation.player import Player
 from deploy.reproduce.demonstrations import demonstrations_of
 from deploy.reproduce.runs import CLONED, CurvePoint, RunPlan, checkpoints_folder
 from deploy.reproduce.work_folder import discriminators_file, policy_file
+from deploy.rewards.relabelling import relabel
 from discriminator.real_states import real_states
 from discriminator.trainer import Discriminators
 from learner.checkpoint import CheckpointStore

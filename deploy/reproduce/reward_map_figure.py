@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deploy.reproduce.experiment import Condition
 from deploy.reproduce.reward_maps import MapScore, PoseGrid, best_pose_degrees
-from deploy.reward_timeline import NAMES
+from deploy.rewards.timeline import NAMES
 
 mpl.use("Agg")  # before pyplot: there is no screen
 from matplotlib import pyplot as plt

@@ -26,7 +26,7 @@ from deploy.reproduce.reward_maps import (
 from deploy.reproduce.runs import FinishedRun, RunPlan
 from deploy.reproduce.tables import mean_and_interval, table
 from deploy.reproduce.work_folder import discriminators_file, policy_file
-from deploy.reward_timeline import draw_timelines, play_greedily, score_steps
+from deploy.rewards.timeline import draw_timelines, play_greedily, score_steps
 
 MAPS: Final = "maps.png"
 MAP_SCORES: Final = "map_scores.png"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from actors.envs.stored_states import StoredStates, read_stored_states
 from broker_config.errors import PresetError
 from broker_config.structure import added
-from deploy.played_episodes import mapped
+from deploy.evaluation.played_episodes import mapped
 from deploy.process import use_one_torch_thread
 from deploy.reproduce.experiment import Experiment, Panel
 from deploy.reproduce.json_lines import read_lines, write_lines
@@ -124,7 +124,7 @@ def states_of(source: str) -> StoredStates:
 
 def _score(source: str, work: Path, plan: RunPlan) -> list[StoredScore]:
     """Plays an episode of a run's last policy from each state."""
-    from deploy.player import Player  # the parent of several processes needs no torch
+    from deploy.evaluation.player import Player  # the parent of several processes needs no torch
     from deploy.reproduce.kept_weights import kept_policy
 
     use_one_torch_thread()

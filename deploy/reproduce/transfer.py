@@ -17,8 +17,8 @@ from actors.rollout import ActingPolicy
 from broker_config.errors import ClothbusError, StorageError
 from broker_config.ownership import FileLock
 from broker_config.preset import with_settings
-from deploy.played_episodes import mapped
-from deploy.player import Player
+from deploy.evaluation.played_episodes import mapped
+from deploy.evaluation.player import Player
 from deploy.process import use_one_torch_thread
 from deploy.reproduce.catalogue import find_experiment
 from deploy.reproduce.experiment import KeptPolicies, TransferTable

@@ -22,8 +22,8 @@ from broker_config.bus import Bus, open_bus
 from broker_config.errors import OwnerUnreachable
 from broker_config.journal import JOURNAL_FILE
 from broker_config.messages import Command, JournalEntry, View
-from broker_config.recording import iter_recording
-from deploy.status import send_control
+from broker_config.recording.recording import iter_recording
+from deploy.commands.status import send_control
 from tests.benchmarks.light_actors import RUN, start_actors, wait_for_learner
 from tests.benchmarks.measuring import RESULTS, Processes, cpu_secs_of, keep_result, percentile
 from tests.process.recorded import settle_recording

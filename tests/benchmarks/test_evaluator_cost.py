@@ -18,12 +18,17 @@ from pathlib import Path
 
 import pytest
 
-from deploy.evaluation import read_results
-from deploy.launch import Supervisor
+from deploy.evaluation.scores import read_results
 from deploy.presets import load_preset
 from deploy.priority import Priority
 from deploy.run_folder import RunFolder, prepare_run_folder
-from deploy.topology import actor_process, evaluator_process, learner_process, router_process
+from deploy.running.launch import Supervisor
+from deploy.running.topology import (
+    actor_process,
+    evaluator_process,
+    learner_process,
+    router_process,
+)
 
 HORIZON = 50
 SETTINGS = (

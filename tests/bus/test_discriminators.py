@@ -20,10 +20,10 @@ from broker_config.messages import (
     Role,
 )
 from broker_config.preset import Preset
-from deploy.demonstrators import by_script
-from deploy.in_process import InProcessActor
-from deploy.make_demonstrations import make_demonstrations
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
+from deploy.running.in_process import InProcessActor
 from discriminator.service import DiscriminatorService
 from learner.checkpoint import CheckpointStore
 from learner.learning import LearningLoop

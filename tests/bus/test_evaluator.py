@@ -26,9 +26,9 @@ from broker_config.messages import (
     weights_digest,
 )
 from broker_config.queries import Responder
-from deploy.evaluate import evaluate
-from deploy.evaluation import WAITING_FOR_OWNER, Results, read_results
-from deploy.evaluator import Evaluator
+from deploy.evaluation.evaluate import evaluate
+from deploy.evaluation.evaluator import Evaluator
+from deploy.evaluation.scores import WAITING_FOR_OWNER, Results, read_results
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, prepare_run_folder
 from learner.snapshots import SnapshotStore

@@ -25,8 +25,8 @@ from actors.views import Views
 from broker_config.bus import Bus, open_bus
 from broker_config.keys import Kind
 from broker_config.messages import Metrics, Role, Ticket, View
-from broker_config.recording import Recording
-from broker_config.recording_segment import to_ns
+from broker_config.recording.recording import Recording
+from broker_config.recording.segment import to_ns
 from tests.conftest import RouterProcess, until_declared
 from tests.viewers import Seen, seen
 

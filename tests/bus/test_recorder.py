@@ -34,9 +34,9 @@ from broker_config.messages import (
     weights_digest,
 )
 from broker_config.queries import Responder
-from broker_config.recording import Recording, iter_recording
+from broker_config.recording.recording import Recording, iter_recording
 from deploy.presets import load_preset
-from deploy.recorder import Recorder
+from deploy.recorder.recorder import Recorder
 from learner.owner import Owner
 from tests.conftest import until_declared
 from tests.process.recorded import settle_recording
@@ -293,7 +293,7 @@ def test_a_flood_of_views_is_dropped_in_part_and_the_journal_is_whole(
     wait_until: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("deploy.recorder_inbox.RecorderInbox.__init__.__defaults__", (100_000,))
+    monkeypatch.setattr("deploy.recorder.inbox.RecorderInbox.__init__.__defaults__", (100_000,))
     running = start()
     wait_until(lambda: host.held and host.held[-1] > 0, "the recorder follows")
     actor = attach("actor", "actor-0")
@@ -333,7 +333,7 @@ def test_a_full_disk_is_said_and_loses_nothing_of_the_journal(
     wait_until: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("deploy.recorder.TROUBLE_SECS", 1.2)
+    monkeypatch.setattr("deploy.recorder.recorder.TROUBLE_SECS", 1.2)
     states: list[str] = []
     observer = attach("observer", "watching")
     key = observer.keys.live("recorder", "recorder")
@@ -369,7 +369,7 @@ def test_a_disk_that_is_full_at_the_very_end_does_not_keep_the_recorder(
     folder: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("deploy.recorder.TROUBLE_SECS", 0.1)
+    monkeypatch.setattr("deploy.recorder.recorder.TROUBLE_SECS", 0.1)
     finish, failures = Recording.finish, [OSError(errno.ENOSPC, "No space left on device")]
 
     def fail_once(recording: Recording) -> None:
@@ -389,7 +389,7 @@ def test_a_disk_that_is_full_at_the_very_end_does_not_keep_the_recorder(
 def test_a_second_recorder_of_the_same_name_is_refused(
     host: Host, start: Start, wait_until: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.recorder.TOKEN_SECS", 0.3)
+    monkeypatch.setattr("deploy.recorder.recorder.TOKEN_SECS", 0.3)
     start()
     wait_until(lambda: host.held and host.held[-1] > 0, "the recorder follows")
     refusal = start("rec-2").wait()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from broker_config.failpoints import Failpoint
 from broker_config.journal import JournalReader
-from deploy.evaluation import modes_of, read_results
+from deploy.evaluation.scores import modes_of, read_results
 from deploy.process import child_environment
 from deploy.run_folder import RunFolder
 from tests.faults.cells import Fault, Role

@@ -17,9 +17,9 @@ import pytest
 from actors.task import make_task_env
 from broker_config.errors import BusError, StorageError
 from broker_config.journal import JOURNAL_FILE, Journal, JournalReader
-from deploy.in_process import InProcessActor
+from deploy.commands.status import ProcessStatus, only_run, read_status
 from deploy.presets import load_preset
-from deploy.status import ProcessStatus, only_run, read_status
+from deploy.running.in_process import InProcessActor
 from learner.checkpoint import CheckpointStore
 from learner.learning import LearningLoop
 from learner.owner import Owner

@@ -16,7 +16,7 @@ from broker_config.messages import (
     SnapshotTaken,
     Verdict,
 )
-from broker_config.recording import iter_recording
+from broker_config.recording.recording import iter_recording
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from broker_config.failpoints import FAILPOINT_VARIABLE, Failpoint
-from deploy.evaluate import evaluate
-from deploy.evaluation import Mode, read_results, scores_of
+from deploy.evaluation.evaluate import evaluate
+from deploy.evaluation.scores import Mode, read_results, scores_of
 from deploy.process import TERMINATED_EXIT
 from deploy.run_folder import RunFolder, prepare_run_folder
 from tests.process.conftest import (

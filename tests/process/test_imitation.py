@@ -14,7 +14,7 @@ from broker_config.codec import decode
 from broker_config.failpoints import Failpoint
 from broker_config.journal import JOURNAL_FILE, JournalReader
 from broker_config.messages import IterationAnnounced, Rewards
-from deploy.status import read_status
+from deploy.commands.status import read_status
 from tests.process.conftest import Start, the_run, wait_for_file, weights
 from tests.process.test_failpoints import arm, fired
 

@@ -12,7 +12,7 @@ import pytest
 from broker_config.failpoints import FAILPOINT_VARIABLE, Failpoint
 from broker_config.journal import JOURNAL_FILE
 from broker_config.messages import View
-from broker_config.recording import iter_recording
+from broker_config.recording.recording import iter_recording
 from tests.process.conftest import (
     Start,
     heartbeat_pid,

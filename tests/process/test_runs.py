@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from broker_config.journal import JOURNAL_FILE
-from deploy.status import read_status
+from deploy.commands.status import read_status
 from tests.process.accounting import settle
 from tests.process.conftest import (
     Start,

@@ -24,7 +24,12 @@ from broker_config.messages import (
     View,
     weights_digest,
 )
-from broker_config.recording import RecordedMessage, Recording, iter_recording, lock_recording
+from broker_config.recording.recording import (
+    RecordedMessage,
+    Recording,
+    iter_recording,
+    lock_recording,
+)
 from broker_config.specs import NetworkSpec
 
 PICTURE = b"\x89PNG of sorts"
@@ -161,7 +166,7 @@ def test_a_clock_that_jumps_backwards_does_no_harm(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = iter(range(10**18, 0, -(10**14)))
-    monkeypatch.setattr("broker_config.recording_segment.time.time_ns", lambda: next(clock))
+    monkeypatch.setattr("broker_config.recording.segment.time.time_ns", lambda: next(clock))
     write(tmp_path, is_finished=True)
     assert offsets(tmp_path) == list(range(12))
     times = [item.log_time_ns for item in iter_recording(tmp_path)]

@@ -22,11 +22,11 @@ from broker_config.messages import (
     View,
     weights_digest,
 )
-from broker_config.recording import Recording
-from broker_config.recording_check import RecordingCheck
-from broker_config.recording_format import Facts, segment_path
-from broker_config.recording_segment import SegmentWriter, to_ns
-from broker_config.recording_viewers import shown_of_view
+from broker_config.recording.check import RecordingCheck
+from broker_config.recording.format import Facts, segment_path
+from broker_config.recording.recording import Recording
+from broker_config.recording.segment import SegmentWriter, to_ns
+from broker_config.recording.viewers import shown_of_view
 from deploy.presets import load_preset
 from tests.synthetic_recording import RUN, Heard, SyntheticRun, journal, record
 
@@ -361,7 +361,7 @@ def test_another_schema_version_is_refused_with_both_versions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heard: list[Heard]
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("broker_config.recording_segment.SCHEMA_VERSION", SCHEMA_VERSION + 1)
+        patch.setattr("broker_config.recording.segment.SCHEMA_VERSION", SCHEMA_VERSION + 1)
         record(tmp_path / "newer", heard[:3])
     rule = rf"expected schema version {SCHEMA_VERSION}, .*; got {SCHEMA_VERSION + 1}; use"
     with pytest.raises(StorageError, match=rule):

@@ -15,11 +15,11 @@ from mcap.writer import Writer
 
 from broker_config.errors import StorageError
 from broker_config.messages import JournalEntry, RecorderStarted, Snapshot
-from broker_config.recording import Recording, iter_recording
-from broker_config.recording_check import RecordingCheck
-from broker_config.recording_format import segment_path
-from broker_config.recording_reader import read_excerpt
-from broker_config.recording_recovery import Recovery, recover_segment
+from broker_config.recording.check import RecordingCheck
+from broker_config.recording.format import segment_path
+from broker_config.recording.reader import read_excerpt
+from broker_config.recording.recording import Recording, iter_recording
+from broker_config.recording.recovery import Recovery, recover_segment
 from deploy.presets import load_preset
 from tests.synthetic_recording import RUN, Heard, SyntheticRun, record
 

@@ -21,12 +21,12 @@ from broker_config.messages import (
     Trajectory,
     View,
 )
-from broker_config.recording import RecordedMessage, Recording, iter_recording
-from broker_config.recording_check import RecordingCheck
-from broker_config.recording_format import segment_path
-from broker_config.recording_reader import read_excerpt
-from broker_config.recording_slice import slice_recording
-from broker_config.recording_slice_plan import Selection
+from broker_config.recording.check import RecordingCheck
+from broker_config.recording.format import segment_path
+from broker_config.recording.reader import read_excerpt
+from broker_config.recording.recording import RecordedMessage, Recording, iter_recording
+from broker_config.recording.slice import slice_recording
+from broker_config.recording.slice_plan import Selection
 from deploy.presets import load_preset
 from tests.synthetic_recording import RUN, Heard, SyntheticRun, record
 
@@ -43,7 +43,7 @@ def heard() -> list[Heard]:
 def recording(tmp_path: Path, heard: list[Heard], monkeypatch: pytest.MonkeyPatch) -> Path:
     """A recording of several segments, with a message each second."""
     clock = iter(range(10_000 * NS, 20_000 * NS, NS))
-    monkeypatch.setattr("broker_config.recording_segment.time.time_ns", lambda: next(clock))
+    monkeypatch.setattr("broker_config.recording.segment.time.time_ns", lambda: next(clock))
     folder = tmp_path / "recording"
     record(folder, heard, segment_bytes=150_000)
     assert len(list(folder.glob("*.mcap"))) > 2
@@ -235,7 +235,7 @@ def test_another_schema_version_is_refused(
     tmp_path: Path, heard: list[Heard], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("broker_config.recording_segment.SCHEMA_VERSION", 1)
+        patch.setattr("broker_config.recording.segment.SCHEMA_VERSION", 1)
         record(tmp_path / "older", heard[:4])
     rule = f"expected schema version {SCHEMA_VERSION}, which this clothbus reads; got 1"
     with pytest.raises(StorageError, match=rule):

@@ -10,7 +10,7 @@ import pytest
 
 from broker_config.errors import MessageError
 from broker_config.messages import JointMotion, Mark, Metrics, View
-from broker_config.recording import Recording
+from broker_config.recording.recording import Recording
 from tests.viewers import Seen, seen
 
 MARKS = (
@@ -151,7 +151,7 @@ def test_a_clock_that_is_wrong_stops_no_recorder(tmp_path: Path, unix_secs: floa
 def test_too_many_numbers_are_left_out_and_stop_no_recorder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("broker_config.recording_segment.MOST_CHANNELS", 5)
+    monkeypatch.setattr("broker_config.recording.segment.MOST_CHANNELS", 5)
     many = [metrics(n, **{f"number {n}": 1.0, f"other {n}": 2.0}) for n in range(4)]
     found = recorded(tmp_path, *many)
     assert found.keys() == {

@@ -9,11 +9,11 @@ import pytest
 from PIL import Image
 
 from broker_config.errors import PresetError, StorageError
-from broker_config.recording import Recording
+from broker_config.recording.recording import Recording
 from deploy.cli import app
-from deploy.demonstration_commands import label, make, show
-from deploy.demonstrators import by_script
-from deploy.make_demonstrations import make_demonstrations
+from deploy.commands.demonstrations import label, make, show
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
 from learner.recorded import read_demonstrations
 

@@ -23,19 +23,24 @@ from actors.task import make_task_env
 from broker_config.codec import encode
 from broker_config.errors import AlreadyOwned, PresetError, StorageError
 from broker_config.messages import DemonstrationsBegun, RunStarted, Trajectory, TrajectoryId, View
-from broker_config.recording import Recording, iter_recording
-from broker_config.recording_check import RecordingCheck
+from broker_config.recording.check import RecordingCheck
+from broker_config.recording.recording import Recording, iter_recording
 from broker_config.version import VERSION
-from deploy import make_demonstrations as making
-from deploy.demonstration_folder import DemonstrationFolder
-from deploy.demonstrators import by_chance, by_policy, by_script, by_script_of_quality
-from deploy.make_demonstrations import make_demonstrations
+from deploy.demonstrations import making
+from deploy.demonstrations.demonstrators import (
+    by_chance,
+    by_policy,
+    by_script,
+    by_script_of_quality,
+)
+from deploy.demonstrations.folder import DemonstrationFolder
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
 from deploy.reproduce.catalogue import find
 from deploy.reproduce.demonstrations import demonstrations_of
-from deploy.run import RunOptions
 from deploy.run_folder import RunFolder, prepare_run_folder
-from deploy.run_in_process import run_in_process
+from deploy.running.run import RunOptions
+from deploy.running.run_in_process import run_in_process
 from learner.recorded import Demonstrations, read_demonstrations
 from learner.tickets import derive_seed
 
@@ -360,7 +365,9 @@ def test_a_quality_is_found_once_and_kept_in_the_record(
     assert isinstance(made.origin, DemonstrationsBegun)
     assert made.origin.demonstrator == first.who
     assert made.origin.demonstrator.quality is not None
-    monkeypatch.setattr("deploy.demonstrators.find_quality", None)  # it is not asked again
+    monkeypatch.setattr(
+        "deploy.demonstrations.demonstrators.find_quality", None
+    )  # it is not asked again
     assert by_script_of_quality(PRESET, folder, 0.5, 6).who == first.who
     for wanted, episodes in ((0.6, 6), (0.5, 7)):
         with pytest.raises(StorageError, match=f"of quality {wanted:g}, measured over {episodes}"):

@@ -13,9 +13,11 @@ import pytest
 from actors.envs.stored_states import read_stored_states, write_stored_states
 from actors.policy import Policy
 from broker_config.errors import AlreadyOwned, PresetError, StorageError
-from deploy import player
-from deploy.evaluate import evaluate, evaluate_on_stored_states, stored_score_table
-from deploy.evaluation import (
+from deploy.evaluation import player
+from deploy.evaluation.evaluate import evaluate, evaluate_on_stored_states, stored_score_table
+from deploy.evaluation.evaluator import next_episode
+from deploy.evaluation.player import Player
+from deploy.evaluation.scores import (
     Episode,
     Results,
     bootstrap_interval,
@@ -23,11 +25,9 @@ from deploy.evaluation import (
     read_results,
     scores_of,
 )
-from deploy.evaluator import next_episode
-from deploy.make_states import make_states
-from deploy.player import Player
 from deploy.presets import load_preset
 from deploy.run_folder import RunFolder, create_run_folder
+from deploy.tasks.make_states import make_states
 from learner.snapshots import SnapshotStore
 from learner.trainer import Trainer
 

@@ -21,15 +21,15 @@ from broker_config.journal import Journal
 from broker_config.messages import DemonstrationsBegun, Trajectory
 from broker_config.version import VERSION
 from deploy.cli import app
-from deploy.demonstration_folder import DemonstrationWriter, label_targets
-from deploy.demonstrators import by_script
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.folder import DemonstrationWriter, label_targets
+from deploy.demonstrations.making import make_demonstrations
 from deploy.exchange.npz import export_npz
 from deploy.exchange.source import open_source
-from deploy.make_demonstrations import make_demonstrations
 from deploy.presets import load_preset
-from deploy.run import RunOptions
 from deploy.run_folder import RunFolder, prepare_run_folder
-from deploy.run_in_process import run_in_process
+from deploy.running.run import RunOptions
+from deploy.running.run_in_process import run_in_process
 from learner.recorded import Demonstrations, read_demonstrations
 
 Capture = pytest.CaptureFixture[str]

@@ -14,8 +14,8 @@ from broker_config.messages import Trajectory
 from broker_config.preset import Preset
 from broker_config.version import VERSION
 from deploy.cli import app
-from deploy.demonstrators import by_script
-from deploy.make_demonstrations import make_demonstrations
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
 from learner.recorded import Demonstrations, read_demonstrations
 

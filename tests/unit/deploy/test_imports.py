@@ -8,11 +8,12 @@ import sys
 HEAVY = {"torch", "gymnasium", "pybullet", "numba", "cv2", "matplotlib", "tensorboard"}
 
 NEITHER_LEARNS_NOR_ACTS = """
-import deploy.cli, deploy.recorder, deploy.roles, deploy.run, deploy.status
+import deploy.cli, deploy.commands.status, deploy.recorder.recorder
+import deploy.running.roles, deploy.running.run
 """
 
 REACHES = """
-import actors.service, deploy.roles
+import actors.service, deploy.running.roles
 from actors.task import make_task_env
 from deploy.presets import load_preset
 preset = load_preset("reaching-smoke")
@@ -23,7 +24,7 @@ env.step(0)
 
 LEARNS = """
 import numpy as np
-import deploy.roles, learner.metrics, learner.service
+import deploy.running.roles, learner.metrics, learner.service
 from deploy.presets import load_preset
 from learner.trainer import Trainer
 preset = load_preset("reaching-smoke")

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from broker_config.errors import StorageError
-from deploy.kept_compute import settle_compute
 from deploy.run_folder import RunFolder
+from deploy.running.kept_compute import settle_compute
 from learner.steps.compute import Compute
 
 

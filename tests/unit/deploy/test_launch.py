@@ -13,10 +13,10 @@ import pytest
 
 from broker_config.keys import parse_key
 from broker_config.messages import Heartbeat
-from deploy.launch import SHORT_LIVES_BEFORE_GIVING_UP, ProcessFailed, Supervisor
 from deploy.process import CONFIGURATION_EXIT, TERMINATED_EXIT, UNREACHABLE_EXIT
-from deploy.topology import ProcessSpec
-from deploy.vital_signs import VitalSigns
+from deploy.running.launch import SHORT_LIVES_BEFORE_GIVING_UP, ProcessFailed, Supervisor
+from deploy.running.topology import ProcessSpec
+from deploy.running.vital_signs import VitalSigns
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def test_a_process_that_keeps_dying_at_once_ends_the_run(tmp_path: Path) -> None
 def test_a_process_that_is_killed_often_but_gets_somewhere_is_kept_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
 ) -> None:
-    monkeypatch.setattr("deploy.launch.PAUSES_SECS", (0.0,))
+    monkeypatch.setattr("deploy.running.launch.PAUSES_SECS", (0.0,))
     signs = VitalSigns()
     leave = f"import signal, sys; signal.signal(15, lambda *_: sys.exit({TERMINATED_EXIT})); "
     with Supervisor(tmp_path, signs) as supervisor:
@@ -113,7 +113,7 @@ def test_a_process_that_is_killed_often_but_gets_somewhere_is_kept_alive(
 def test_a_router_that_is_killed_often_but_carries_heartbeats_is_kept_alive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.launch.PAUSES_SECS", (0.0,))
+    monkeypatch.setattr("deploy.running.launch.PAUSES_SECS", (0.0,))
     signs = VitalSigns()
     with Supervisor(tmp_path, signs) as supervisor:
         process = supervisor.start(Script("router", "router", (), FOREVER))
@@ -134,7 +134,7 @@ def test_a_router_that_is_killed_often_but_carries_heartbeats_is_kept_alive(
 def test_a_router_that_is_away_for_a_while_does_not_end_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("deploy.launch.PAUSES_SECS", (0.0,))
+    monkeypatch.setattr("deploy.running.launch.PAUSES_SECS", (0.0,))
     signs = VitalSigns()
     beat(signs, 1)  # so there was a router
     with Supervisor(tmp_path, signs) as supervisor:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from broker_config.errors import PresetError
+from deploy.demonstrations.quality import TOLERANCE, find_quality
 from deploy.presets import load_preset
-from deploy.quality import TOLERANCE, find_quality
 
 TASK = load_preset("reaching-smoke").task
 

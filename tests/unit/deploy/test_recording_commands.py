@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from broker_config.codec import SCHEMA_VERSION
-from broker_config.recording_format import segment_path
+from broker_config.recording.format import segment_path
 from deploy import cli
 from deploy.byte_progress import byte_progress
 from deploy.presets import load_preset
@@ -102,7 +102,7 @@ def test_info_of_another_schema_version_shows_what_the_index_says(
     clothbus: Clothbus, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr("broker_config.recording_segment.SCHEMA_VERSION", 7)
+        patch.setattr("broker_config.recording.segment.SCHEMA_VERSION", 7)
         record(tmp_path / "newer", list(SyntheticRun(PRESET).messages())[:5])
     code, out, _ = clothbus("info", tmp_path / "newer")
     assert code == 0

@@ -17,7 +17,7 @@ from broker_config.errors import AlreadyOwned, PresetError, StorageError
 from broker_config.messages import Trajectory
 from broker_config.ownership import FileLock
 from broker_config.preset import Preset
-from deploy.make_demonstrations import LEAST_TARGETS
+from deploy.demonstrations.making import LEAST_TARGETS
 from deploy.presets import preset_names
 from deploy.reproduce import command
 from deploy.reproduce.catalogue import EXPERIMENTS, find

@@ -17,13 +17,13 @@ from broker_config.errors import StorageError
 from broker_config.journal import Journal, JournalReader
 from broker_config.messages import Rewards
 from broker_config.preset import Preset
-from deploy.demonstrators import by_script
-from deploy.in_process import InProcessActor, InProcessDiscriminators
-from deploy.make_demonstrations import make_demonstrations
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
-from deploy.reward_audit import audit_rewards
-from deploy.reward_timeline import recorded_timelines
+from deploy.rewards.audit import audit_rewards
+from deploy.rewards.timeline import recorded_timelines
 from deploy.run_folder import RunFolder, prepare_run_folder
+from deploy.running.in_process import InProcessActor, InProcessDiscriminators
 from learner.checkpoint import CheckpointStore
 from learner.learning import IterationLabelled, LearningLoop, RewardsAwaited
 from learner.owner import Owner

@@ -29,7 +29,7 @@ from deploy.reproduce.reward_map_section import (
 )
 from deploy.reproduce.reward_maps import best_pose_degrees, pose_grid, reward_maps, score_map
 from deploy.reproduce.runs import FinishedRun
-from deploy.reward_timeline import play_greedily, score_steps
+from deploy.rewards.timeline import play_greedily, score_steps
 from discriminator.stored import StoredDiscriminators
 
 torch.set_num_threads(1)

@@ -4,8 +4,8 @@ import pytest
 from PIL import Image
 
 from broker_config.errors import PresetError
-from deploy import spread_check
-from deploy.task_commands import spread
+from deploy.commands.tasks import spread
+from deploy.tasks import spread_check
 
 
 def test_folded_handkerchiefs_come_back_and_leave_a_film_strip(

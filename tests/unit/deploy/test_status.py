@@ -8,7 +8,7 @@ from rich.console import Console
 
 from broker_config.heart import HUNG_SECS
 from broker_config.messages import Heartbeat
-from deploy.status import ProcessStatus, status_table
+from deploy.commands.status import ProcessStatus, status_table
 
 
 def shown(*processes: ProcessStatus) -> str:

@@ -10,11 +10,11 @@ from actors.envs.handkerchief import HandkerchiefFlipEnv
 from actors.envs.stored_states import GRID_M, read_stored_states
 from actors.robot.planning import Obstacle
 from broker_config.errors import PresetError, StorageError
-from deploy import make_states, task_check
-from deploy.reach_check import check_reach, portion
-from deploy.task_check import check_task
-from deploy.task_commands import reach, states, task, watch
-from deploy.watch import watch as write_episode
+from deploy.commands.tasks import reach, states, task, watch
+from deploy.tasks import make_states, task_check
+from deploy.tasks.reach_check import check_reach, portion
+from deploy.tasks.task_check import check_task
+from deploy.tasks.watch import watch as write_episode
 
 
 def test_a_good_task_s_expert_succeeds_and_chance_does_not() -> None:

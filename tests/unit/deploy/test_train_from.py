@@ -25,12 +25,9 @@ from broker_config.messages import (
     TrajectoryId,
 )
 from broker_config.preset import Preset
-from deploy.in_process import InProcessActor
-from deploy.offline_origin import keep_origin, origin_of
-from deploy.presets import load_preset
-from deploy.recorded_episodes import RecordedEpisodes, RecordedRun
-from deploy.run_folder import RunFolder, prepare_run_folder, require_acting
-from deploy.train_from import (
+from deploy.offline.origin import keep_origin, origin_of
+from deploy.offline.recorded_episodes import RecordedEpisodes, RecordedRun
+from deploy.offline.train_from import (
     RecordedActor,
     compare_weights,
     load_reward,
@@ -38,6 +35,9 @@ from deploy.train_from import (
     recorded_demonstrations,
     train_from,
 )
+from deploy.presets import load_preset
+from deploy.run_folder import RunFolder, prepare_run_folder, require_acting
+from deploy.running.in_process import InProcessActor
 from learner.checkpoint import CheckpointStore
 from learner.learning import LearningLoop
 from learner.owner import Owner

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from broker_config.keys import parse_key
 from broker_config.messages import Heartbeat, Role
-from deploy.vital_signs import START_SECS, Living, VitalSigns
+from deploy.running.vital_signs import START_SECS, Living, VitalSigns
 
 HUNG = 60.0
 OWNER, ROUTER, ONE, TWO = 1, 2, 3, 4

@@ -15,10 +15,10 @@ from broker_config.errors import PresetError
 from broker_config.journal import Journal
 from broker_config.messages import IterationEnded, SnapshotTaken, weights_digest
 from broker_config.preset import InitialisationPreset, Preset
-from deploy.demonstrators import by_script
-from deploy.in_process import InProcessActor
-from deploy.make_demonstrations import make_demonstrations
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
 from deploy.presets import load_preset
+from deploy.running.in_process import InProcessActor
 from learner.checkpoint import CheckpointStore
 from learner.learning import EpisodeAbsorbed, LearningLoop, PolicyReady
 from learner.owner import Owner

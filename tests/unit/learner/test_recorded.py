@@ -19,7 +19,7 @@ from broker_config.messages import (
     Trajectory,
     Verdict,
 )
-from broker_config.recording import Recording
+from broker_config.recording.recording import Recording
 from learner.recorded import Demonstrations, first_samples, read_demonstrations
 
 Make = Callable[..., Trajectory]

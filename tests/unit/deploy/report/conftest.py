@@ -20,17 +20,17 @@ from broker_config.messages import (
     weights_digest,
 )
 from broker_config.preset import Preset
-from broker_config.recording import Recording
-from deploy.demonstrators import by_script
-from deploy.evaluate import evaluate
-from deploy.evaluation import Score
-from deploy.in_process import InProcessActor, InProcessDiscriminators
-from deploy.make_demonstrations import make_demonstrations
+from broker_config.recording.recording import Recording
+from deploy.demonstrations.demonstrators import by_script
+from deploy.demonstrations.making import make_demonstrations
+from deploy.evaluation.evaluate import evaluate
+from deploy.evaluation.scores import Score
 from deploy.presets import load_preset
 from deploy.report.gather import gather
 from deploy.report.record import RunRecord
 from deploy.report.sources import open_source
 from deploy.run_folder import RunFolder, create_run_folder
+from deploy.running.in_process import InProcessActor, InProcessDiscriminators
 from learner.checkpoint import CheckpointStore
 from learner.learning import EpisodeAbsorbed, LearningLoop, PolicyReady
 from learner.owner import Owner

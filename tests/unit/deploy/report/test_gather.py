@@ -30,9 +30,9 @@ from broker_config.messages import (
     TrajectoryId,
     Verdict,
 )
-from broker_config.recording import RecordedMessage, Recording
-from broker_config.recording_reader import TornSegment, iter_recording
-from deploy.evaluation import scores_of
+from broker_config.recording.reader import TornSegment, iter_recording
+from broker_config.recording.recording import RecordedMessage, Recording
+from deploy.evaluation.scores import scores_of
 from deploy.presets import load_preset
 from deploy.report.composition import mean_parts
 from deploy.report.gather import gather

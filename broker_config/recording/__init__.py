@@ -1,0 +1,1 @@
+"""Recordings of runs as MCAP files: written, read, checked, mended and cut."""

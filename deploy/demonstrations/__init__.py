@@ -1,0 +1,1 @@
+"""Demonstrations: who makes them, how good, and where they are kept."""

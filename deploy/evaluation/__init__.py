@@ -1,0 +1,1 @@
+"""Scores of policies: of finished runs, and of live ones beside them."""

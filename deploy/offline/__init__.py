@@ -1,0 +1,1 @@
+"""Runs from recordings: learning without a robot, and replay."""

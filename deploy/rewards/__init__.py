@@ -1,0 +1,1 @@
+"""What discriminators have given: computed again, and shown."""

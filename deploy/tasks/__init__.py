@@ -1,0 +1,1 @@
+"""Tasks alone: self-tests, stored states, pictures for people."""
