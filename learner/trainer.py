@@ -26,11 +26,10 @@ from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
 from learner.assessment import Assessment, assess, double_q_signals
 from learner.memory import LocalMemory
 from learner.minibatches import balanced, shuffled
-from learner.steps.compute import ON_CPU, Compute, TrainingPath
+from learner.steps.compute import EVALUATED_AT_ONCE, ON_CPU, Compute, TrainingPath
 from learner.steps.eager_steps import EagerSteps, GradientSteps
 from learner.steps.graphed_steps import GraphedSteps, exact_float32
 from learner.steps.optimiser import FusedAdam, build_optimiser, named_state, overwrite
-from learner.steps.product_steps import EVALUATED_AT_ONCE, ProductEvaluation, ProductSteps
 from learner.teaching_signal import bellman_error
 
 _EVALUATED_AT_ONCE = 2 * EVALUATED_AT_ONCE
@@ -346,6 +345,7 @@ def _make_steps(
         case "products-bf16" | "winograd":
             # Not above: they import numba, for which processes that make no steps need not wait.
             from learner.steps.patch_convolutions import PatchConvolutions
+            from learner.steps.product_steps import ProductEvaluation, ProductSteps
             from learner.steps.winograd import WinogradConvolutions
 
             convolutions = PatchConvolutions if path == "products-bf16" else WinogradConvolutions

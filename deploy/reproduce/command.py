@@ -76,12 +76,11 @@ def reproduce(
             draw_transfer_table(found, work, folder, command, jobs, draw_only=draw_only)
         return
     experiment = with_changes(found, seeds, settings, conditions, panels)
-    plans, curves = list(experiment.plans()), folder / CURVES
     if draw_only:
-        draw(experiment, finished_runs(plans, curves, iterations), folder, command, work / name)
+        runs = finished_runs(list(experiment.plans()), folder / CURVES, iterations)
+        draw(experiment, runs, folder, command, work / name)
         return
     compute = Compute(device, training_path)
-    sys.stderr.write(f"{name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
     with FileLock(work / name / "reproduce.lock", f"experiment in {work / name}"):
         runs = _make_runs(experiment, folder, work / name, compute, jobs, iterations)
         draw(experiment, runs, folder, command, work / name)
@@ -101,8 +100,9 @@ def _make_runs(
     from deploy.reproduce.stored_scores import read_scores, score_last_policies
 
     curves, scores = folder / CURVES, folder / SCORES
-    anew = runs_to_repeat(experiment, read_runs(curves), read_scores(scores), work)
     plans = list(experiment.plans())
+    sys.stderr.write(f"{experiment.name}: {len(plans)} runs in all, {compute}, {jobs} at a time\n")
+    anew = runs_to_repeat(experiment, read_runs(curves), read_scores(scores), work)
     runs = finish_runs(plans, curves, work, compute, jobs, iterations, anew)
     score_last_policies(experiment, runs, scores, work, jobs)
     return runs

@@ -22,6 +22,10 @@ _PATHS: dict[str, tuple[TrainingPath, ...]] = {
 multiplies numbers of bfloat16 it is `products-bf16`."""
 
 
+EVALUATED_AT_ONCE = 64
+"""Pictures of which paths that keep buffers compute preferences at a time."""
+
+
 @dataclass(frozen=True)
 class Compute:
     """What a trainer computes on.

@@ -29,8 +29,8 @@ class PatchConvolutions:
         height, width, channels = network.spec.observation_shape
         self._width = width
         # Lines are whole words; no patch reaches what is added.
-        lines = torch.zeros((batch_size, height, -(-width // WORD) * WORD, channels))
-        self._pixels = lines.to(torch.bfloat16)
+        lines = batch_size, height, -(-width // WORD) * WORD, channels
+        self._pixels = torch.zeros(lines, dtype=torch.bfloat16)
         self._convolutions: list[_Convolution] = []
         inputs, size = self._pixels, (height, width)
         for number, layer in enumerate(network.convolutions):

@@ -17,11 +17,9 @@ from torch.nn import functional
 
 from actors.networks import PreferenceNetwork
 from learner.memory import LocalMemory
+from learner.steps.compute import EVALUATED_AT_ONCE
 from learner.steps.optimiser import FusedAdam
 from learner.steps.weight_matrix import WeightMatrix, forward_with_relu, pass_relu
-
-EVALUATED_AT_ONCE = 64
-"""Pictures of which `ProductEvaluation` computes preferences at a time."""
 
 
 class Convolutions(Protocol):

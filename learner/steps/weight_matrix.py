@@ -11,7 +11,8 @@ from learner.steps.patch_kernels import sum_rows
 class WeightMatrix:
     """A layer's weights as a matrix, and where their gradients go.
 
-    With bfloat16 they are rounded before each product, and the gradients' sums are float32.
+    With float32 products read the parameters themselves. With bfloat16 they are scaled and rounded
+    before each product, and the gradients' sums are float32.
 
     Attributes:
         rounded: What the products use, [O, I]: the weights times the scale of the inputs.
@@ -26,21 +27,25 @@ class WeightMatrix:
         self._gradients = torch.zeros_like(layer.weight), torch.zeros_like(layer.bias)
         self._shape = shape
         self._scale = scale
-        is_exact = dtype == torch.float32 and scale == 1.0
-        self.rounded = self._matrix(self._weight) if is_exact else torch.empty(shape, dtype=dtype)
-        self.bias = self._bias.detach() if is_exact else torch.empty_like(self._bias, dtype=dtype)
-        self._is_exact = is_exact
-        # Kept, since fresh pages of its size take longer than the product.
-        self._product = torch.empty_like(self.rounded)
+        self._is_exact = dtype == torch.float32
+        if self._is_exact:
+            assert scale == 1.0, "what is scaled is not the parameter itself"
+            self.rounded, self.bias = self._matrix(self._weight), self._bias.detach()
+        else:
+            self.rounded = torch.empty(shape, dtype=dtype)
+            self.bias = torch.empty_like(self._bias, dtype=dtype)
+            # Kept, since fresh pages of its size take longer than the product.
+            self._product = torch.empty_like(self.rounded)
 
     def refresh(self) -> None:
         """Follows the parameters, where the products do not read them directly."""
-        if not self._is_exact:
-            if self._scale == 1.0:
-                self.rounded.copy_(self._matrix(self._weight))  # several times as fast as `mul`
-            else:
-                torch.mul(self._matrix(self._weight), self._scale, out=self.rounded)
-            self.bias.copy_(self._bias)
+        if self._is_exact:
+            return
+        if self._scale == 1.0:
+            self.rounded.copy_(self._matrix(self._weight))  # several times as fast as `mul`
+        else:
+            torch.mul(self._matrix(self._weight), self._scale, out=self.rounded)
+        self.bias.copy_(self._bias)
 
     def set_gradients(self, output_gradients: Tensor, inputs: Tensor) -> None:
         """Leaves the gradients at the parameters.
@@ -51,14 +56,14 @@ class WeightMatrix:
         """
         weight, bias = self._gradients
         matrix = self._matrix(weight)
-        if output_gradients.dtype == torch.float32:
+        if self._is_exact:
             torch.mm(output_gradients.t(), inputs, out=matrix)
             torch.sum(output_gradients, 0, out=bias)
         else:
             matrix.copy_(torch.mm(output_gradients.t(), inputs, out=self._product))
+            if self._scale != 1.0:
+                matrix.mul_(self._scale)
             sum_rows(output_gradients.view(torch.uint16).numpy(), bias.numpy())
-        if self._scale != 1.0:
-            matrix.mul_(self._scale)
         self._weight.grad, self._bias.grad = weight, bias
 
     def _matrix(self, weight: Tensor) -> Tensor:

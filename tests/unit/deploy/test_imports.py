@@ -58,3 +58,7 @@ def test_learning_imports_numba_alone_of_the_compilers() -> None:
     modules = imported(LEARNS)
     assert {"torch", "numba"} <= modules
     assert not modules & SLOW_FOR_ALL
+
+
+def test_who_makes_no_steps_waits_for_no_compiler() -> None:
+    assert not imported("import learner.trainer") & {*SLOW_FOR_ALL, "numba"}
