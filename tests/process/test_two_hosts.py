@@ -234,8 +234,12 @@ def _seen_twice(folder: Path) -> list[str]:
         pytest.param("tcp/10.77.0.99:7447", id="no such host"),
     ],
 )
-def test_a_wrong_address_is_named_with_what_to_do(start_on: StartOn, address: str) -> None:
-    actor = start_on(ACTOR_HOST, "lost", "actor", "--connect", address, "--run", "run")
+def test_a_wrong_address_is_named_with_what_to_do(
+    start_on: StartOn, address: str, tmp_path: Path
+) -> None:
+    # A spool of its own: both cases may run at once.
+    options = "--connect", address, "--run", "run", "--spool", tmp_path / "spool.sqlite"
+    actor = start_on(ACTOR_HOST, "lost", "actor", *options)
     assert actor.wait(60) == 4, actor.log.read_text()
     said = " ".join(actor.log.read_text().split())
     assert f"router: expected an answer at {address}; got none" in said
