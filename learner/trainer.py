@@ -342,15 +342,10 @@ def _make_steps(
             return GraphedSteps(network, optimiser, memory), network
         case "reference":
             return EagerSteps(network, optimiser, memory), network
-        case "products-bf16" | "winograd":
-            # Not above: they import numba, for which processes that make no steps need not wait.
-            from learner.steps.patch_convolutions import PatchConvolutions
+        case "winograd" | "winograd-bf16":
+            # Not above: it imports numba, for which processes that make no steps need not wait.
             from learner.steps.product_steps import ProductEvaluation, ProductSteps
-            from learner.steps.winograd import WinogradConvolutions
 
-            convolutions = PatchConvolutions if path == "products-bf16" else WinogradConvolutions
+            factors = torch.bfloat16 if path == "winograd-bf16" else torch.float32
             # Teaching signals are float32, and so is all that they are computed from.
-            return (
-                ProductSteps(network, optimiser, memory, convolutions),
-                ProductEvaluation(network, WinogradConvolutions),
-            )
+            return ProductSteps(network, optimiser, memory, factors), ProductEvaluation(network)

@@ -192,7 +192,7 @@ CHAPTER_3: Final = (
                 (
                     _by_path(DPN, "reference", "C7"),
                     _by_path(DPN, "winograd", "C0"),
-                    _by_path(DPN, "products-bf16", "C1"),
+                    _by_path(DPN, "winograd-bf16", "C1"),
                 ),
                 seeds=5,
             ),

@@ -8,18 +8,18 @@ from typing import Literal
 
 from broker_config.errors import PresetError, StorageError
 
-TrainingPath = Literal["reference", "winograd", "products-bf16", "graphs"]
+TrainingPath = Literal["reference", "winograd", "winograd-bf16", "graphs"]
 """`reference`: autograd, one operation at a time, float32: the definition of correct.
-`winograd`: products by hand, those of convolutions by Winograd's algorithm, float32.
-`products-bf16`: products by hand, rounded to bfloat16. `graphs`: autograd recorded as CUDA graphs,
-float32."""
+`winograd`: matrix products by hand, those of convolutions by Winograd's algorithm, float32.
+`winograd-bf16`: the same, of factors that are rounded to bfloat16. `graphs`: autograd recorded as
+CUDA graphs, float32."""
 
 _PATHS: dict[str, tuple[TrainingPath, ...]] = {
-    "cpu": ("winograd", "products-bf16", "reference"),
+    "cpu": ("winograd", "winograd-bf16", "reference"),
     "cuda": ("graphs", "reference"),
 }
 """By type of device; the first is chosen where nothing else is asked for, but on a processor that
-multiplies numbers of bfloat16 it is `products-bf16`."""
+multiplies numbers of bfloat16 it is `winograd-bf16`."""
 
 
 EVALUATED_AT_ONCE = 64
@@ -56,7 +56,7 @@ class Compute:
             return self.path
         device_type = self.device.partition(":")[0]
         if device_type == "cpu" and multiplies_bfloat16():
-            return "products-bf16"
+            return "winograd-bf16"
         return _PATHS[device_type][0]
 
     def as_begun(self, begun: str) -> Compute:

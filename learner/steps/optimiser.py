@@ -24,6 +24,9 @@ class FusedAdam:
     The state's tensors are never replaced, only written: a CUDA graph may hold their addresses.
 
     Attributes:
+        learning_rate: Before the bias correction.
+        betas: Of the means of gradients and of their squares.
+        epsilon: Added to the root of the latter.
         state: "step" f32[], "exp_avg" and "exp_avg_sq" of each parameter.
     """
 
@@ -37,10 +40,10 @@ class FusedAdam:
     ) -> None:
         """Allocates the state of all parameters of a network; steps count from `first_step`."""
         self._parameters = list(network.parameters())
-        self._learning_rate = learning_rate
-        self._betas = betas
-        self._epsilon = epsilon
-        self.state = {
+        self.learning_rate = learning_rate
+        self.betas = betas
+        self.epsilon = epsilon
+        self.state: dict[Tensor, dict[str, Tensor]] = {
             parameter: {
                 "step": torch.tensor(first_step, dtype=torch.float32, device=parameter.device),
                 "exp_avg": torch.zeros_like(parameter),
@@ -53,6 +56,13 @@ class FusedAdam:
         """Forgets the gradients: backward then writes new ones instead of adding to them."""
         for parameter in self._parameters:
             parameter.grad = None
+
+    def step_rounded(self, parameter: Tensor, gradients: Tensor, rounded: Tensor) -> None:
+        """Makes a step with one parameter; see `learner.steps.rounded_adam`."""
+        # Not above: it imports numba, for which processes that make no steps need not wait.
+        from learner.steps.rounded_adam import step_rounded
+
+        step_rounded(self, parameter, gradients, rounded)
 
     @torch.no_grad()
     def step(self) -> None:
@@ -70,11 +80,11 @@ class FusedAdam:
             fused=True,
             capturable=steps[0][0].device.type == "cuda",
             amsgrad=False,
-            beta1=self._betas[0],
-            beta2=self._betas[1],
-            lr=self._learning_rate,
+            beta1=self.betas[0],
+            beta2=self.betas[1],
+            lr=self.learning_rate,
             weight_decay=0.0,
-            eps=self._epsilon,
+            eps=self.epsilon,
             maximize=False,
         )
 

@@ -2,14 +2,11 @@
 
 Gradients are written straight into the memory of the network's own parameters, and hardly anything
 is allocated or reordered in a step. Only the head, which is small and has three forms, is left to
-autograd, in float32. Parameters, teaching signals and the optimiser's state are float32, too,
-whatever the layers below compute with.
+autograd, in float32. Parameters, teaching signals and the optimiser's state are float32, too: only
+what the layers below multiply may be bfloat16.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -19,29 +16,7 @@ from actors.networks import PreferenceNetwork
 from learner.memory import LocalMemory
 from learner.steps.compute import EVALUATED_AT_ONCE
 from learner.steps.optimiser import FusedAdam
-from learner.steps.weight_matrix import WeightMatrix, forward_with_relu, pass_relu
-
-
-class Convolutions(Protocol):
-    """All convolutions of a network, for minibatches of one size."""
-
-    @property
-    def maps(self) -> Tensor:
-        """Units [B, h, w, C] of the last convolution, always the same memory."""
-
-    def forward(self, pictures: Tensor) -> None:
-        """Computes the maps.
-
-        Args:
-            pictures: u8[B, H, W, C].
-        """
-
-    def backward(self, gradients: Tensor) -> None:
-        """Leaves the gradients of the loss at the convolutions' parameters.
-
-        Args:
-            gradients: Of the loss by the maps, in their shape.
-        """
+from learner.steps.winograd import WinogradConvolutions
 
 
 class ProductSteps:
@@ -52,7 +27,7 @@ class ProductSteps:
         network: PreferenceNetwork,
         optimiser: FusedAdam,
         memory: LocalMemory,
-        make_convolutions: Callable[[PreferenceNetwork, int], Convolutions],
+        factors: torch.dtype,
     ) -> None:
         """Prepares nothing yet: buffers are made when a minibatch size is met.
 
@@ -60,12 +35,12 @@ class ProductSteps:
             network: On the CPU, in the layout that `build_network` gives.
             optimiser: From `build_optimiser`, for the network.
             memory: Gives pictures and actions.
-            make_convolutions: Of the network, for minibatches of a size.
+            factors: What is multiplied: float32 or bfloat16.
         """
         self._network = network
         self._optimiser = optimiser
         self._memory = memory
-        self._make_convolutions = make_convolutions
+        self._factors = factors
         self._trunk: _Trunk | None = None
 
     def run(self, batches: Tensor, targets: Tensor) -> Tensor:
@@ -73,17 +48,18 @@ class ProductSteps:
         batch_size = batches.shape[1]
         # One size at a time: a memory that is smaller than a minibatch has another at each update.
         if self._trunk is None or self._trunk.batch_size != batch_size:
-            convolutions = self._make_convolutions(self._network, batch_size)
-            self._trunk = _Trunk(self._network, convolutions)
+            self._trunk = _Trunk(self._network, batch_size, self._factors)
         trunk = self._trunk
         positions, actions = self._memory.ring_positions, self._memory.samples.actions
         losses = torch.empty(len(batches))
+        trunk.follow()
         for step, batch in enumerate(batches):
             hidden = trunk.forward(self._memory.ring.index_select(0, positions[batch]))
             self._optimiser.zero_grad()
             losses[step] = self._head_step(hidden, actions[batch], targets[batch])
             trunk.backward([units.grad for units in hidden])
             self._optimiser.step()
+            trunk.step_rounded(self._optimiser)
         return losses
 
     def _head_step(self, hidden: list[Tensor], actions: Tensor, targets: Tensor) -> Tensor:
@@ -96,16 +72,16 @@ class ProductSteps:
 
 
 class ProductEvaluation:
-    """Computes preferences by matrix products; equals the network up to rounding."""
+    """Computes preferences by matrix products of float32; equals the network up to rounding."""
 
-    def __init__(
-        self,
-        network: PreferenceNetwork,
-        make_convolutions: Callable[[PreferenceNetwork, int], Convolutions],
-    ) -> None:
-        """Prepares it; the arguments are those of `ProductSteps`."""
+    def __init__(self, network: PreferenceNetwork) -> None:
+        """Allocates what it needs.
+
+        Args:
+            network: On the CPU, in the layout that `build_network` gives.
+        """
         self._network = network
-        self._trunk = _Trunk(network, make_convolutions(network, EVALUATED_AT_ONCE))
+        self._trunk = _Trunk(network, EVALUATED_AT_ONCE, torch.float32)
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
@@ -127,14 +103,23 @@ class ProductEvaluation:
 class _Trunk:
     """All layers below the head, for minibatches of one size."""
 
-    def __init__(self, network: PreferenceNetwork, convolutions: Convolutions) -> None:
-        maps = convolutions.maps
-        self.batch_size = len(maps)
-        self._convolutions = convolutions
-        # The network's features are ordered by channel first.
-        self._features = maps.new_empty((len(maps), maps[0].numel()))
-        self._feature_gradients = torch.empty_like(self._features)
-        self._hidden = [_Hidden(layer, self._features) for layer in network.hidden_layers]
+    def __init__(self, network: PreferenceNetwork, batch_size: int, factors: torch.dtype) -> None:
+        self.batch_size = batch_size
+        self._convolutions = WinogradConvolutions(network, batch_size, factors)
+        self._feature_gradients = torch.empty_like(self._convolutions.features)
+        self._hidden = [
+            _Hidden(layer, self._convolutions.features) for layer in network.hidden_layers
+        ]
+
+    def follow(self) -> None:
+        """Follows parameters that something else has changed than these steps."""
+        for layer in self._hidden:
+            layer.follow()
+
+    def step_rounded(self, optimiser: FusedAdam) -> None:
+        """Makes the steps of all parameters to which `backward` gives no gradients."""
+        for layer in self._hidden:
+            layer.step_rounded(optimiser)
 
     @torch.no_grad()
     def forward(self, pictures: Tensor) -> list[Tensor]:
@@ -144,42 +129,64 @@ class _Trunk:
             pictures: u8[B, H, W, C].
         """
         self._convolutions.forward(pictures)
-        self._by_channel(self._features).copy_(self._convolutions.maps)
-        units = [layer.forward() for layer in self._hidden]
-        return [each.to(torch.float32, copy=True).requires_grad_() for each in units]
+        return [layer.forward().requires_grad_() for layer in self._hidden]
 
     @torch.no_grad()
     def backward(self, unit_gradients: list[Tensor | None]) -> None:
-        """Leaves the gradients of the loss at the layers' parameters."""
+        """Leaves the gradients of the loss at parameters; see `step_rounded` for the others."""
         for number, (layer, gradients) in enumerate(zip(self._hidden, unit_gradients, strict=True)):
             assert gradients is not None
             layer.backward(gradients, self._feature_gradients, accumulate=number > 0)
-        self._convolutions.backward(self._by_channel(self._feature_gradients))
-
-    def _by_channel(self, features: Tensor) -> Tensor:
-        """A view of features [B, C * h * w] with the axes of the maps [B, h, w, C]."""
-        batch_size, height, width, channels = self._convolutions.maps.shape
-        return features.view(batch_size, channels, height, width).permute(0, 2, 3, 1)
+        self._convolutions.backward(self._feature_gradients)
 
 
 class _Hidden:
-    """A fully connected layer on the features, and the ReLU after it."""
+    """A fully connected layer on the features, and the ReLU after it.
+
+    Most of a network's weights are here. If they are rounded, they and their gradients are so once
+    in a step, by the optimiser, which passes over them anyway.
+    """
 
     def __init__(self, layer: nn.Linear, features: Tensor) -> None:
-        self._features = features
-        self._weights = WeightMatrix(layer, tuple(layer.weight.shape), features.dtype, 1.0)
-        self._units = features.new_empty((len(features), layer.out_features))
-        self._gradients = torch.empty_like(self._units)
+        self._layer, self._features = layer, features
+        self._is_exact = features.dtype == torch.float32
+        weight = layer.weight.detach()
+        self._factors = weight if self._is_exact else weight.to(features.dtype)
+        self._weight_gradients = torch.zeros_like(self._factors)
+        self._bias_gradients = torch.zeros_like(layer.bias)
+        self._units = torch.empty(0)
+
+    def follow(self) -> None:
+        """See `_Trunk.follow`."""
+        if not self._is_exact:
+            self._factors.copy_(self._layer.weight.detach())
 
     def forward(self) -> Tensor:
-        forward_with_relu(self._features, self._weights, self._units)
-        return self._units
+        """max(0, x W' + b) of the features, f32[B, 512]."""
+        sums = torch.mm(self._features, self._factors.t())
+        self._units = torch.add(sums, self._layer.bias).relu_()
+        return self._units.detach()
 
     def backward(self, gradients: Tensor, feature_gradients: Tensor, *, accumulate: bool) -> None:
-        self._gradients.copy_(gradients)
-        pass_relu(self._gradients, self._units)
-        self._weights.set_gradients(self._gradients, self._features)
+        """Leaves the parameters' gradients, and adds or writes those of the features.
+
+        Args:
+            gradients: Of the loss by what `forward` gave.
+            feature_gradients: [B, I].
+            accumulate: Whether to add to them.
+        """
+        passed = gradients.masked_fill(self._units == 0, 0.0)
+        self._layer.bias.grad = torch.sum(passed, 0, out=self._bias_gradients)
+        passed = passed.to(self._factors.dtype)
+        torch.mm(passed.t(), self._features, out=self._weight_gradients)
+        if self._is_exact:
+            self._layer.weight.grad = self._weight_gradients
         if accumulate:
-            feature_gradients.addmm_(self._gradients, self._weights.rounded)
+            feature_gradients.addmm_(passed, self._factors)
         else:
-            torch.mm(self._gradients, self._weights.rounded, out=feature_gradients)
+            torch.mm(passed, self._factors, out=feature_gradients)
+
+    def step_rounded(self, optimiser: FusedAdam) -> None:
+        """See `_Trunk.step_rounded`."""
+        if not self._is_exact:
+            optimiser.step_rounded(self._layer.weight, self._weight_gradients, self._factors)

@@ -173,8 +173,8 @@ def candidates(device: str, peaks: dict[str, float]) -> list[str]:
         on_cuda, is_graphs = device != "cpu", path == "graphs"
         if on_cuda != is_graphs and path != "reference":
             continue
-        if path == "products-bf16" and peaks["bfloat16"] < peaks["float32"]:
-            print("products-bf16: left out, this processor has no products of bfloat16")
+        if path == "winograd-bf16" and peaks["bfloat16"] < peaks["float32"]:
+            print("winograd-bf16: left out, this processor has no products of bfloat16")
             continue
         names.append(path)
     return names

@@ -56,6 +56,24 @@ def test_adam_equals_torch_s_own() -> None:
 
 
 @pytest.mark.parametrize("preset", [ADAM, RMSPROP])
+def test_steps_by_rounded_gradients_are_those_of_the_same_widened(preset: OptimiserPreset) -> None:
+    ours, theirs = nn.Linear(70, 30), nn.Linear(70, 30)
+    theirs.load_state_dict(ours.state_dict())
+    rounding, widening = build_optimiser(preset, ours), build_optimiser(preset, theirs)
+    rounded = torch.empty_like(ours.weight, dtype=torch.bfloat16)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(50):
+        gradients = torch.randn(30, 70, generator=generator).to(torch.bfloat16)
+        rounding.step_rounded(ours.weight, gradients, rounded)
+        theirs.weight.grad = gradients.to(torch.float32)
+        widening.step()
+        assert torch.equal(rounded, ours.weight.to(torch.bfloat16))
+    torch.testing.assert_close(ours.weight, theirs.weight, rtol=1e-5, atol=1e-6)
+    for part, state in rounding.state[ours.weight].items():
+        torch.testing.assert_close(state, widening.state[theirs.weight][part], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("preset", [ADAM, RMSPROP])
 def test_goes_on_bit_identically_from_its_saved_state(preset: OptimiserPreset) -> None:
     network = layer()
     optimiser = build_optimiser(preset, network)
