@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal
+from typing import Literal, get_args
 
 from broker_config.errors import PresetError, StorageError
 
@@ -66,8 +66,14 @@ class Compute:
             begun: The text of the compute that began it.
 
         Raises:
-            StorageError: Another path was asked for, or another device.
+            StorageError: Another path was asked for, or another device; or this version has no such
+                path.
         """
+        if begun.partition(" ")[0] not in get_args(TrainingPath):
+            raise StorageError(
+                f"expected to go on by {begun}, as it was begun; got a version of clothbus without "
+                "it; go on with the version that began it, or begin anew"
+            )
         paths = _PATHS[self.device.partition(":")[0]] if self.path is None else (self.path,)
         for path in paths:
             if str(same := replace(self, path=path)) == begun:

@@ -1,4 +1,4 @@
-"""The gradient methods, both on torch's fused Adam kernel."""
+"""The gradient methods, both as Adam: by torch's kernel; by our own where weights are rounded."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def build_optimiser(preset: OptimiserPreset, network: nn.Module) -> FusedAdam:
 
     RMSProp is the old Keras form, which the source's software had: v = rho * v + (1 - rho) * g**2
     and theta -= rate * g / (sqrt(v) + epsilon). That is Adam without momentum (beta1 = 0) and
-    without bias correction (a step count so large that there is none left), so that the fused
+    without bias correction (a step count so large that there is none left), so that one
     kernel serves both: one pass over the parameters, and one launch on a GPU.
     """
     rate, epsilon = preset.learning_rate, preset.epsilon

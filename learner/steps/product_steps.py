@@ -1,9 +1,9 @@
 """The gradient steps on a CPU, written as matrix products into buffers that are kept.
 
-Gradients are written straight into the memory of the network's own parameters, and hardly anything
-is allocated or reordered in a step. Only the head, which is small and has three forms, is left to
-autograd, in float32. Parameters, teaching signals and the optimiser's state are float32, too: only
-what the layers below multiply may be bfloat16.
+Hardly anything is allocated or reordered in a step. Only the head, which is small and has three
+forms, is left to autograd, in float32. Parameters, teaching signals and the optimiser's state are
+float32, too. Of the layers below the head, all that goes into a product and all that comes out of
+one may be bfloat16; what is added up or transformed in between is float32.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ class _Hidden:
         self._is_exact = features.dtype == torch.float32
         weight = layer.weight.detach()
         self._factors = weight if self._is_exact else weight.to(features.dtype)
-        self._weight_gradients = torch.zeros_like(self._factors)
-        self._bias_gradients = torch.zeros_like(layer.bias)
+        self._weight_gradients = torch.empty_like(self._factors)
+        self._bias_gradients = torch.empty_like(layer.bias)
         self._units = torch.empty(0)
 
     def follow(self) -> None:

@@ -14,12 +14,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.steps.factors import Factors, as_array, compiled, get, put
+from learner.steps.factors import as_array, compiled
 
 if TYPE_CHECKING:
     from learner.steps.optimiser import FusedAdam
 
 Floats = NDArray[np.float32]
+Bits = NDArray[np.uint16]
+"""Numbers of bfloat16."""
+
+_HALF, _LOW, _ONE = np.uint32(16), np.uint32(0x7FFF), np.uint32(1)
 
 
 @torch.no_grad()
@@ -42,8 +46,8 @@ def step_rounded(
         state["exp_avg"].view(-1).numpy(),
         state["exp_avg_sq"].view(-1).numpy(),
         as_array(rounded.view(-1)),
-        np.float32(1.0 - beta1),
-        np.float32(1.0 - beta2),
+        np.float32(beta1),
+        np.float32(beta2),
         np.float32(optimiser.learning_rate / (1.0 - beta1**n_steps)),
         np.float32(1.0 / math.sqrt(1.0 - beta2**n_steps)),
         np.float32(optimiser.epsilon),
@@ -53,20 +57,23 @@ def step_rounded(
 @compiled  # type: ignore[untyped-decorator] # numba publishes no types
 def _step(
     parameter: Floats,
-    gradients: Factors,
+    gradients: Bits,
     mean: Floats,
     square: Floats,
-    rounded: Factors,
-    rate1: np.float32,
-    rate2: np.float32,
+    rounded: Bits,
+    beta1: np.float32,
+    beta2: np.float32,
     step_size: np.float32,
     correction: np.float32,
     epsilon: np.float32,
 ) -> None:
+    rate1, rate2 = np.float32(1.0) - beta1, np.float32(1.0) - beta2
     for k in range(len(parameter)):
-        gradient = get(gradients, k)
-        m = mean[k] + rate1 * (gradient - mean[k])
-        v = square[k] + rate2 * (gradient * gradient - square[k])
+        gradient = np.uint32(np.uint32(gradients[k]) << _HALF).view(np.float32)
+        m = beta1 * mean[k] + rate1 * gradient
+        v = beta2 * square[k] + (rate2 * gradient) * gradient
         after = parameter[k] - step_size * m / (np.sqrt(v) * correction + epsilon)
         mean[k], square[k], parameter[k] = m, v, after
-        put(rounded, k, after)
+        bits = np.float32(after).view(np.uint32)
+        is_odd = np.uint32(np.uint32(bits >> _HALF) & _ONE)
+        rounded[k] = np.uint16(np.uint32(np.uint32(bits + _LOW) + is_odd) >> _HALF)

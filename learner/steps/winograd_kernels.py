@@ -29,13 +29,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.steps.factors import Factors, compiled, get, put
+from learner.steps.factors import Factors, compiled
 
 POINTS = 4
 """n: inputs of a tile along each axis."""
 
 
-_A_HALF = np.float32(0.5)
+_HALF, _LOW, _ONE = np.uint32(16), np.uint32(0x7FFF), np.uint32(1)
+"""Of bfloat16: how many bits fewer it has, the most of them that round down, and the last kept."""
+_A_HALF, _NOTHING = np.float32(0.5), np.float32(0.0)
 
 _MOST_OUTPUTS = _MOST_WEIGHTS = 3
 
@@ -56,6 +58,26 @@ class Tiling(NamedTuple):
 
 
 @compiled  # type: ignore[untyped-decorator] # numba publishes no types
+def _get(numbers: Any, k: int) -> Any:
+    """A number as float32."""
+    # Which of the two it is, is the same for all numbers of an array: LLVM asks before its loops.
+    if numbers.itemsize == 4:
+        return np.float32(numbers[k])
+    return np.uint32(np.uint32(numbers[k]) << _HALF).view(np.float32)
+
+
+@compiled  # type: ignore[untyped-decorator] # numba publishes no types
+def _put(numbers: Any, k: int, value: Any) -> None:
+    """Keeps a number, rounded to even if it is to be bfloat16."""
+    if numbers.itemsize == 4:
+        numbers[k] = value
+    else:
+        bits = np.float32(value).view(np.uint32)
+        is_odd = np.uint32(np.uint32(bits >> _HALF) & _ONE)
+        numbers[k] = np.uint16(np.uint32(np.uint32(bits + _LOW) + is_odd) >> _HALF)
+
+
+@compiled  # type: ignore[untyped-decorator] # numba publishes no types
 def _to_points(x0: Any, x1: Any, x2: Any, x3: Any) -> Any:
     """B' x."""
     return x0 - x2, x1 + x2, x2 - x1, x3 - x1
@@ -72,6 +94,12 @@ def _from_points(m0: Any, m1: Any, m2: Any, m3: Any, last: Any) -> Any:
     """A' m, three outputs; `last` is 1 if the third is one, 0 if there are two."""
     total, difference = m1 + m2, m1 - m2
     return m0 + total, difference + (np.float32(1.0) - last) * m3, total + last * m3
+
+
+@compiled  # type: ignore[untyped-decorator] # numba publishes no types
+def _relu(x: Any) -> Any:
+    """max(0, x), but NaN stays NaN."""
+    return _NOTHING if x < _NOTHING else x
 
 
 @compiled  # type: ignore[untyped-decorator] # numba publishes no types
@@ -130,10 +158,10 @@ def transform_weights(weights: Floats, transformed: Factors) -> None:
                 y2, y3 = transformed[8 + q, output, at], transformed[12 + q, output, at]
                 for k in range(run):
                     v0, v1, v2, v3 = _weights_to_points(x0[k], x1[k], x2[k], last)
-                    put(y0, k, v0)
-                    put(y1, k, v1)
-                    put(y2, k, v2)
-                    put(y3, k, v3)
+                    _put(y0, k, v0)
+                    _put(y1, k, v1)
+                    _put(y2, k, v2)
+                    _put(y3, k, v3)
 
 
 @compiled  # type: ignore[untyped-decorator] # numba publishes no types
@@ -221,10 +249,10 @@ def transform_inputs(inputs: Floats, tiling: Tiling, transformed: Factors) -> No
                 y2, y3 = transformed[8 + q, tile, at], transformed[12 + q, tile, at]
                 for k in range(run):
                     v0, v1, v2, v3 = _to_points(x0[k], x1[k], x2[k], x3[k])
-                    put(y0, k, v0)
-                    put(y1, k, v1)
-                    put(y2, k, v2)
-                    put(y3, k, v3)
+                    _put(y0, k, v0)
+                    _put(y1, k, v1)
+                    _put(y2, k, v2)
+                    _put(y3, k, v3)
 
 
 @compiled  # type: ignore[untyped-decorator] # numba publishes no types
@@ -249,7 +277,7 @@ def add_input_gradients(transformed: Factors, tiling: Tiling, gradients: Floats)
                 y0, y1, y2, y3 = passed[0, q], passed[1, q], passed[2, q], passed[3, q]
                 for k in range(run):
                     y0[k], y1[k], y2[k], y3[k] = _gradients_from_points(
-                        get(x0, k), get(x1, k), get(x2, k), get(x3, k)
+                        _get(x0, k), _get(x1, k), _get(x2, k), _get(x3, k)
                     )
             for p in range(POINTS):
                 line = gradients[picture, tiling.stride * (down + p) + dy, across * run :]
@@ -276,7 +304,7 @@ def transform_outputs(transformed: Factors, bias: Floats, tiling: Tiling, output
     run = len(bias)
     passed = np.empty((_MOST_OUTPUTS, POINTS, run), np.float32)
     made = np.empty(_MOST_OUTPUTS * run, np.float32)
-    last, zero = np.float32(tiling.size == _MOST_OUTPUTS), np.float32(0.0)
+    last = np.float32(tiling.size == _MOST_OUTPUTS)
     for tile in range(transformed.shape[1]):
         picture, down, across = _place(tile, tiling)
         for q in range(POINTS):
@@ -285,7 +313,7 @@ def transform_outputs(transformed: Factors, bias: Floats, tiling: Tiling, output
             y0, y1, y2 = passed[0, q], passed[1, q], passed[2, q]
             for k in range(run):
                 y0[k], y1[k], y2[k] = _from_points(
-                    get(x0, k), get(x1, k), get(x2, k), get(x3, k), last
+                    _get(x0, k), _get(x1, k), _get(x2, k), _get(x3, k), last
                 )
         width = min(tiling.size, tiling.outputs[1] - across) * run
         for row in range(min(tiling.size, tiling.outputs[0] - down)):
@@ -293,9 +321,9 @@ def transform_outputs(transformed: Factors, bias: Floats, tiling: Tiling, output
             y0, y1, y2 = made[:run], made[run : 2 * run], made[2 * run :]
             for k in range(run):
                 v0, v1, v2 = _from_points(x0[k], x1[k], x2[k], x3[k], last)
-                y0[k] = max(zero, v0 + bias[k])
-                y1[k] = max(zero, v1 + bias[k])
-                y2[k] = max(zero, v2 + bias[k])
+                y0[k] = _relu(v0 + bias[k])
+                y1[k] = _relu(v1 + bias[k])
+                y2[k] = _relu(v2 + bias[k])
             line = outputs[picture, down + row, across * run :]
             for k in range(width):
                 line[k] = made[k]
@@ -318,7 +346,7 @@ def transform_output_gradients(
     passed = np.empty((_MOST_OUTPUTS, POINTS, run), np.float32)
     masked = np.empty(_MOST_OUTPUTS * run, np.float32)
     sums = np.zeros(_MOST_OUTPUTS * run, np.float32)
-    last, zero = np.float32(tiling.size == _MOST_OUTPUTS), np.float32(0.0)
+    last = np.float32(tiling.size == _MOST_OUTPUTS)
     for tile in range(transformed.shape[1]):
         picture, down, across = _place(tile, tiling)
         width = min(tiling.size, tiling.outputs[1] - across) * run
@@ -329,7 +357,7 @@ def transform_output_gradients(
             given = gradients[picture, down + row, across * run :]
             units = outputs[picture, down + row, across * run :]
             for k in range(width):
-                kept = zero if units[k] <= zero else given[k]
+                kept = _NOTHING if units[k] <= _NOTHING else given[k]
                 masked[k] = kept
                 sums[k] += kept
             x0, x1, x2 = masked[:run], masked[run : 2 * run], masked[2 * run :]
@@ -342,10 +370,10 @@ def transform_output_gradients(
             y2, y3 = transformed[8 + q, tile], transformed[12 + q, tile]
             for k in range(run):
                 v0, v1, v2, v3 = _gradients_to_points(x0[k], x1[k], x2[k], last)
-                put(y0, k, v0)
-                put(y1, k, v1)
-                put(y2, k, v2)
-                put(y3, k, v3)
+                _put(y0, k, v0)
+                _put(y1, k, v1)
+                _put(y2, k, v2)
+                _put(y3, k, v3)
     for k in range(run):
         bias[k] += sums[k] + sums[run + k] + sums[2 * run + k]
 
@@ -366,7 +394,7 @@ def maps_to_features(maps: Floats, n_channels: int, features: Factors) -> None:
             for row in range(maps.shape[1]):
                 line = maps[picture, row]
                 for column in range(n_columns):
-                    put(ordered, at + column, line[column * n_channels + channel])
+                    _put(ordered, at + column, line[column * n_channels + channel])
                 at += n_columns
 
 
@@ -380,5 +408,5 @@ def maps_from_features(features: Factors, n_channels: int, maps: Floats) -> None
             for row in range(maps.shape[1]):
                 line = maps[picture, row]
                 for column in range(n_columns):
-                    line[column * n_channels + channel] = get(ordered, at + column)
+                    line[column * n_channels + channel] = _get(ordered, at + column)
                 at += n_columns

@@ -26,6 +26,13 @@ def test_a_run_goes_on_by_the_path_that_it_was_begun_with(tmp_path: Path) -> Non
     assert folder.compute.read_text() == f"{Compute()}\n"
 
 
+def test_a_path_that_this_version_does_not_have_is_said(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.compute.write_text("products-bf16 steps on cpu\n")
+    with pytest.raises(StorageError, match=r"products-bf16 .*got a version of clothbus without it"):
+        settle_compute(folder, Compute())
+
+
 def test_what_cannot_be_kept_is_said(tmp_path: Path) -> None:
     folder = RunFolder(tmp_path)
     folder.compute.mkdir()

@@ -94,13 +94,15 @@ def test_it_goes_on_bit_identically(episode: Callable[..., Trajectory]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "most"), [("winograd", 0.1), ("graphs", 0.02), ("winograd-bf16", 0.8)]
+    ("path", "most"), [("winograd", 1e-4), ("graphs", 1e-4), ("winograd-bf16", 0.6)]
 )
 def test_fast_paths_make_the_same_steps(
     path: str, most: float, episode: Callable[..., Trajectory]
 ) -> None:
-    reference = begun(preset_with(), episode, path="reference")
-    other = begun(preset_with(), episode, path="reference" if path == "graphs" else path)
+    # Adam's own epsilon, 1e-8, follows the sign of gradients that are rounding alone.
+    preset = preset_with("optimiser.epsilon=1e-3")
+    reference = begun(preset, episode, path="reference")
+    other = begun(preset, episode, path="reference" if path == "graphs" else path)
     if path == "graphs":
         steps = GraphedSteps(other._network, other._optimiser, other._memory, record=run_once)
         other._steps = steps
@@ -111,8 +113,7 @@ def test_fast_paths_make_the_same_steps(
             trainer.update()
     assert other.gradient_steps == reference.gradient_steps
     for name, weights in reference.weights().items():
-        # Adam follows the sign of gradients, also of those that are rounding alone; what has
-        # nothing in common would be at 1.4.
+        # What has nothing in common would be at 1.4.
         error = (other.weights()[name] - weights).norm() / (weights - before[name]).norm()
         assert error < most, f"{name}: relative error of what was learned {error:.2g}"
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import math
+import statistics
 from dataclasses import replace
 from functools import partial
 
@@ -29,6 +31,8 @@ HEADS: tuple[Head, ...] = ("plain", "dueling-penalty", "dueling-exact", "dueling
 SHAPES = ((84, 84, 1), (36, 36, 3), (47, 61, 3))
 """As in the source; the smallest; one where no stride divides anything."""
 BATCH = torch.tensor([3, 0, 23, 11, 11])
+LARGE_BATCH = torch.randint(N_SAMPLES, (40,), generator=torch.Generator().manual_seed(3))
+"""More pictures than go through the convolutions at once."""
 TARGETS = torch.randn(N_SAMPLES, generator=torch.Generator().manual_seed(1))
 
 
@@ -47,8 +51,9 @@ def filled_memory(shape: tuple[int, int, int]) -> LocalMemory:
     return memory
 
 
-def network_of(head: Head, shape: tuple[int, int, int]) -> PreferenceNetwork:
-    return build_network(NetworkSpec(shape, N_ACTIONS, head, 1.0), 3, starts_at_zero_value=True)
+def network_of(head: Head, shape: tuple[int, int, int], seed: int = 3) -> PreferenceNetwork:
+    spec = NetworkSpec(shape, N_ACTIONS, head, 1.0)
+    return build_network(spec, seed, starts_at_zero_value=True)
 
 
 class Recording:
@@ -113,17 +118,20 @@ def relative_error(got: Tensor, expected: Tensor) -> float:
     return float((got - expected).norm() / expected.norm())
 
 
+@pytest.mark.parametrize("batch", [BATCH, LARGE_BATCH], ids=["5 samples", "40 samples"])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("head", HEADS)
-def test_gradients_are_those_of_autograd(head: Head, shape: tuple[int, int, int]) -> None:
+def test_gradients_are_those_of_autograd(
+    head: Head, shape: tuple[int, int, int], batch: Tensor
+) -> None:
     network, memory = network_of(head, shape), filled_memory(shape)
-    expected, expected_loss = gradients_by_autograd(network, memory, BATCH, TARGETS)
-    got, loss = gradients_by_products(network, memory, BATCH, TARGETS, torch.float32)
+    expected, expected_loss = gradients_by_autograd(network, memory, batch, TARGETS)
+    got, loss = gradients_by_products(network, memory, batch, TARGETS, torch.float32)
     assert loss == pytest.approx(expected_loss, rel=1e-5)
     assert got.keys() == expected.keys()
     for name, gradient in expected.items():
         error = relative_error(got[name], gradient)
-        assert error < 2e-6, f"{name}: relative error {error:.2g}"
+        assert error < 4e-6, f"{name}: relative error {error:.2g}"
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -131,20 +139,19 @@ def test_gradients_are_those_of_autograd(head: Head, shape: tuple[int, int, int]
 def test_bfloat16_rounds_hardly_worse_than_mixed_precision_of_torch(
     head: Head, shape: tuple[int, int, int]
 ) -> None:
-    """Over all parameters: in a single layer, a unit at 0 may fall to either side.
-
-    In most of these it rounds better: 0.6 to 1.3 times the error of torch.
-    """
-    network, memory = network_of(head, shape), filled_memory(shape)
-    expected, _ = gradients_by_autograd(network, memory, BATCH, TARGETS)
-    by_torch, _ = gradients_by_autograd(network, memory, BATCH, TARGETS, autocast=True)
-    got, _ = gradients_by_products(network, memory, BATCH, TARGETS, torch.bfloat16)
-
-    def joined(gradients: dict[str, Tensor]) -> Tensor:
-        return torch.cat([gradients[name].flatten().double() for name in expected])
-
-    error = relative_error(joined(got), joined(expected))
-    assert error < 1.5 * relative_error(joined(by_torch), joined(expected))
+    """Over all parameters, and of several networks: a unit at 0 may fall to either side."""
+    memory, ratios = filled_memory(shape), []
+    for seed in range(5):
+        network = network_of(head, shape, seed)
+        exact, _ = gradients_by_autograd(network, memory, LARGE_BATCH, TARGETS)
+        by_torch, _ = gradients_by_autograd(network, memory, LARGE_BATCH, TARGETS, autocast=True)
+        got, _ = gradients_by_products(network, memory, LARGE_BATCH, TARGETS, torch.bfloat16)
+        joined, of_torch, expected = (
+            torch.cat([gradients[name].flatten().double() for name in exact])
+            for gradients in (got, by_torch, exact)
+        )
+        ratios.append(relative_error(joined, expected) / relative_error(of_torch, expected))
+    assert statistics.median(ratios) < 1.5
 
 
 @pytest.mark.parametrize(
@@ -208,6 +215,27 @@ def trained(asked: Compute) -> Trainer:
         )
         trainer.update()
     return trainer
+
+
+@pytest.mark.parametrize("factors", [torch.float32, torch.bfloat16])
+def test_a_network_that_has_diverged_shows_it(factors: torch.dtype) -> None:
+    network, memory = network_of("plain", (36, 36, 1)), filled_memory((36, 36, 1))
+    with torch.no_grad():
+        network.convolutions[0].get_parameter("weight").fill_(torch.nan)
+    _, loss = gradients_by_products(network, memory, BATCH, TARGETS, factors)
+    assert math.isnan(loss)
+    assert ProductEvaluation(network)(memory.ring[:3]).isnan().all()
+
+
+@pytest.mark.parametrize("path", ["winograd", "winograd-bf16"])
+def test_a_trainer_that_goes_back_makes_the_same_steps_again(path: str) -> None:
+    trainer = trained(Compute(path=path))  # type: ignore[arg-type]
+    state = trainer.get_state()
+    trainer.update()
+    first = trainer.weights_bytes()
+    trainer.set_state(state)
+    trainer.update()
+    assert trainer.weights_bytes() == first
 
 
 @pytest.mark.parametrize("path", ["winograd", "winograd-bf16"])
