@@ -15,7 +15,7 @@ from actors.cloth.masks import cloth_mask
 from actors.cloth.rasteriser import HANDKERCHIEF_COLOURS, ClothColours, draw_cloth
 from actors.envs.cloth_options import ClothTaskOptions
 from actors.envs.cloth_task import ClothTaskEnv
-from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
+from actors.envs.fold_targets import USUAL_FOLDING, FoldTarget, FoldThresholds, scripted_target
 from actors.envs.planned_actions import PlannedAction, planned_fold
 
 
@@ -97,7 +97,7 @@ class FoldLinesEnv(ClothTaskEnv):
             len(self.task.lines),
             options or ClothTaskOptions(),
             self.task.colours,
-            {"xpbd": FOLDING_XPBD},
+            USUAL_FOLDING,
         )
 
     def _plan(self, action: int) -> PlannedAction:

@@ -1,6 +1,6 @@
 """What a garment looks like when it is folded well: scripted folds, made on the fast engine."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, Protocol
 
@@ -14,6 +14,7 @@ from actors.cloth.gestures import Gesture
 from actors.cloth.guard import guard
 from actors.cloth.masks import cloth_mask
 from actors.cloth.measures import aligned_iou, mean_particle_distance_m
+from actors.cloth.meshes import refined
 from actors.cloth.rasteriser import draw_cloth
 from actors.cloth.xpbd_engine import XpbdEngine
 from actors.cloth.xpbd_settings import XpbdSettings
@@ -26,6 +27,17 @@ FOLDING_XPBD: Final[dict[str, Any]] = {
 }
 """With less friction cloth slides under the fold; stiffer, small folds spring open; looked at
 earlier, they still do."""
+
+
+FOLDING_PYBULLET: Final[dict[str, Any]] = {"bending_stiffness": 0.2, "friction": 1.0}
+"""Stiffer, a sleeve that was folded in springs open again; looked at."""
+
+USUAL_FOLDING: Final = {"xpbd": FOLDING_XPBD, "pybullet": FOLDING_PYBULLET}
+"""By engine."""
+
+_COARSEST_SPACING_M: Final = 0.02
+"""Of a mesh that folds flat enough for a target. PyBullet's are coarser: folded on one of them, a
+shirt stood 8 cm high, with a sleeve beside it."""
 
 
 @dataclass(frozen=True)
@@ -77,17 +89,23 @@ class FoldStep(Protocol):
 def scripted_target(garment: Garment, script: tuple[FoldStep, ...]) -> FoldTarget:
     """The garment after a script, from spread out in the middle of the table.
 
+    A mesh that is too coarse to fold flat is refined for it; its own vertices are where they are
+    then.
+
     Raises:
         ClothEngineError: a step broke the cloth.
     """
+    fine = garment
+    while fine.mesh.spacing_m > _COARSEST_SPACING_M:
+        fine = replace(fine, mesh=refined(fine.mesh))
     engine = XpbdEngine(XpbdSettings(**FOLDING_XPBD))
-    engine.reset(garment.mesh)
+    engine.reset(fine.mesh)
     for step in script:
-        engine.perform(step.gesture(engine.vertices_in_world(), garment))
+        engine.perform(step.gesture(engine.vertices_in_world(), fine))
     vertices = engine.vertices_in_world()
-    if reason := guard(garment.mesh, vertices):
+    if reason := guard(fine.mesh, vertices):
         raise ClothEngineError(
             f"target of {garment.name}: expected a sound cloth after the script {script}; got "
             f"{reason}; choose another script, or a mesh with smaller triangles"
         )
-    return FoldTarget(garment, vertices)
+    return FoldTarget(garment, vertices[: len(garment.mesh.vertices_m)])

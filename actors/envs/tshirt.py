@@ -14,7 +14,7 @@ from actors.cloth.pick_points import extreme_pick_points
 from actors.cloth.rasteriser import ClothColours, Paint, draw_cloth
 from actors.envs.cloth_options import ClothTaskOptions
 from actors.envs.cloth_task import ClothTaskEnv
-from actors.envs.fold_targets import FOLDING_XPBD, FoldTarget, FoldThresholds, scripted_target
+from actors.envs.fold_targets import USUAL_FOLDING, FoldTarget, FoldThresholds, scripted_target
 from actors.envs.planned_actions import PlannedAction, planned_pick_and_drop
 from actors.envs.tshirt_reward import RewardForm, TshirtReward
 
@@ -86,7 +86,7 @@ class TshirtFoldEnv(ClothTaskEnv):
         self._reward = TshirtReward(reward_form)
         n_actions = N_PICK_POINTS * len(DROP_POINTS_M)
         given = options or ClothTaskOptions(horizon=8, view_half_width_m=VIEW_HALF_WIDTH_M)
-        super().__init__("tshirt", n_actions, given, COLOURS, {"xpbd": FOLDING_XPBD})
+        super().__init__("tshirt", n_actions, given, COLOURS, USUAL_FOLDING)
 
     def _begin(self) -> None:
         self._reward = TshirtReward(self._reward_form)

@@ -30,8 +30,8 @@ def write_transfer_page(
         f"**Published** ({transfer.source}): {transfer.published}",
         f"Success at the end of {transfer.episodes} greedy episodes of each last policy, on seeds "
         "that no run learns from. In brackets the 95 % interval of a hierarchical bootstrap, over "
-        "seeds and within each over its episodes; then successes and episodes of all seeds. The "
-        "script and chance play the starts of the first seed.",
+        "seeds and within each over its episodes; then successes and episodes of all seeds, and "
+        "the mean return. The script and chance play the starts of the first seed.",
         *_sections(transfer, scores),
         "## How it was made",
         f"```\n{command}\n```",
@@ -79,8 +79,9 @@ def _cell(scores: Sequence[WorldScore]) -> str:
     if not scores:
         return "-"
     successes = np.array([score.successes for score in scores], np.float64)
-    counts = f"{successes.sum():.0f}/{successes.size}"
+    mean_return = np.mean([score.returns for score in scores])
+    rest = f"{successes.sum():.0f}/{successes.size}, return {mean_return:.1f}"
     if len(successes) == 1:
-        return f"{successes.mean():.0%}, {counts}"
+        return f"{successes.mean():.0%}, {rest}"
     low, high = hierarchical_interval(successes)
-    return f"{successes.mean():.0%} ({low:.0%} to {high:.0%}), {counts}"
+    return f"{successes.mean():.0%} ({low:.0%} to {high:.0%}), {rest}"

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from actors.cloth.meshes import ClothMesh, edge_lengths_m, rectangular_sheet
+from actors.cloth.meshes import ClothMesh, edge_lengths_m, rectangular_sheet, refined
 
 
 def _areas_m2(mesh: ClothMesh) -> np.ndarray:
@@ -41,6 +41,18 @@ def test_edge_lengths_follow_the_vertices() -> None:
     np.testing.assert_allclose(
         edge_lengths_m(2 * mesh.vertices_m, mesh.edges), 2 * mesh.rest_edge_lengths_m
     )
+
+
+def test_a_refined_mesh_is_the_same_cloth_of_half_the_spacing() -> None:
+    mesh = rectangular_sheet(4, 0.3)
+    fine = refined(mesh)
+    np.testing.assert_array_equal(fine.vertices_m[: len(mesh.vertices_m)], mesh.vertices_m)
+    assert len(fine.vertices_m) == 7 * 7
+    assert fine.spacing_m == pytest.approx(mesh.spacing_m / 2)
+    corners = fine.vertices_m[fine.faces]
+    areas_m2 = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] / 2
+    assert areas_m2.min() > 0.0, "each triangle has its front side up"
+    assert areas_m2.sum() == pytest.approx(0.3**2)
 
 
 @pytest.mark.parametrize(("n", "size_m"), [(1, 0.3), (12, 0.0), (12, float("nan"))])

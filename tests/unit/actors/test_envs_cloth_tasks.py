@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 from actors.cloth.engine import ClothEngineError
 from actors.cloth.masks import cloth_mask
+from actors.cloth.measures import FAR_ABOVE
 from actors.cloth.rasteriser import DAYLIGHT
 from actors.demonstrate.acting import scripted_demonstrator
 from actors.envs import ENV_IDS, ClothTaskEnv, FoldLinesEnv, TshirtFoldEnv, make_env
@@ -136,6 +137,30 @@ def test_a_target_is_much_smaller_than_the_garment_and_made_once() -> None:
     target = scripted_target(env.garment, tuple(map(FoldAlong, (0, 2, 4))))
     assert target is scripted_target(env.garment, tuple(map(FoldAlong, (0, 2, 4))))
     assert target.mask(env.camera).sum() < 0.5 * env.flat_px
+
+
+@pytest.mark.parametrize("env_id", ["ShirtFold", "TrousersFold", "HandkerchiefFold"])
+def test_a_target_is_the_same_fold_whatever_the_mesh(env_id: str) -> None:
+    fine, coarse = make(env_id), make(env_id, engine="pybullet")
+    targets = []
+    for env in (fine, coarse):
+        assert isinstance(env, FoldLinesEnv)
+        garment = env._make_garment()
+        script = tuple(FoldAlong(env.task.lines[action]) for action in env.task.script)
+        targets.append(scripted_target(garment, script))
+        env.close()
+    usual, other = targets
+    assert len(other.vertices_in_world) == len(other.garment.mesh.vertices_m)
+    assert other.vertices_in_world[:, 2].max() < 1.5 * usual.vertices_in_world[:, 2].max()
+    assert usual.iou(other.mask(FAR_ABOVE), FAR_ABOVE) > 0.85
+
+
+@pytest.mark.timeout(300)
+def test_what_the_script_folds_on_the_other_engine_is_folded_by_the_same_thresholds() -> None:
+    env = make("ShirtFold", engine="pybullet", horizon=3)
+    info = play(env, 0)
+    assert info["success"], info
+    env.close()
 
 
 def test_randomisation_is_off_by_default_and_bounded() -> None:
