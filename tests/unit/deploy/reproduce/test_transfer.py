@@ -116,7 +116,7 @@ def test_policies_that_are_there_are_tested_once_beside_script_and_chance(
     monkeypatch.setitem(catalogue.TRANSFER_TABLES, "elsewhere", longer)
     with pytest.raises(StorageError, match="got none"):
         page_of(folder, work, draw_only=True)
-    assert ", 1/1 |" in page_of(folder, work)
+    assert ", 1/1, return " in page_of(folder, work)
     monkeypatch.setitem(catalogue.TRANSFER_TABLES, "elsewhere", ELSEWHERE)
     played.clear()
     assert "seeds: 2" in page_of(folder, work)
