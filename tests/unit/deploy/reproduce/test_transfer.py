@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from broker_config.errors import PresetError, StorageError
+from broker_config.errors import AlreadyOwned, PresetError, StorageError
+from broker_config.ownership import FileLock
 from broker_config.preset import with_settings
 from deploy.reproduce import catalogue, command, transfer
 from deploy.reproduce.catalogue import TRANSFER_TABLES
@@ -99,6 +100,10 @@ def test_policies_that_are_there_are_tested_once_beside_script_and_chance(
     monkeypatch.setattr(transfer, "_play", play_and_tell)
     assert page_of(folder, work) == page
     assert played == []
+    with FileLock(work / "elsewhere.lock", "another process"):
+        with pytest.raises(AlreadyOwned):
+            page_of(folder, work)
+        assert "100%, 2/2" in page_of(folder, work, draw_only=True), "what there is so far"
 
     make_policies(work, seeds=2)
     assert "| world | behaviour cloning, seeds: 2 | the script | chance |" in page_of(folder, work)
