@@ -290,7 +290,8 @@ TRANSFER_OF_CHAPTER_4: Final = (
             "Other sizes and materials: 10 to 15 % larger or smaller, 2.7 to 4.5 times as stiff or "
             "as soft, 25 to 37 % more or less friction; training had none of it.",
             "PyBullet's garments have fewer vertices and other dynamics; the thresholds of success "
-            "are those of XPBD.",
+            "are those of XPBD. Trousers that the script has folded there lie 24 to 31 mm from the "
+            "target on average, where 25 are allowed: their layers pass through each other.",
         ),
     ),
 )
