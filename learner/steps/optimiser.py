@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
@@ -24,9 +26,6 @@ class FusedAdam:
     The state's tensors are never replaced, only written: a CUDA graph may hold their addresses.
 
     Attributes:
-        learning_rate: Before the bias correction.
-        betas: Of the means of gradients and of their squares.
-        epsilon: Added to the root of the latter.
         state: "step" f32[], "exp_avg" and "exp_avg_sq" of each parameter.
     """
 
@@ -40,9 +39,9 @@ class FusedAdam:
     ) -> None:
         """Allocates the state of all parameters of a network; steps count from `first_step`."""
         self._parameters = list(network.parameters())
-        self.learning_rate = learning_rate
-        self.betas = betas
-        self.epsilon = epsilon
+        self._learning_rate = learning_rate
+        self._betas = betas
+        self._epsilon = epsilon
         self.state: dict[Tensor, dict[str, Tensor]] = {
             parameter: {
                 "step": torch.tensor(first_step, dtype=torch.float32, device=parameter.device),
@@ -57,12 +56,33 @@ class FusedAdam:
         for parameter in self._parameters:
             parameter.grad = None
 
+    @torch.no_grad()
     def step_rounded(self, parameter: Tensor, gradients: Tensor, rounded: Tensor) -> None:
-        """Makes a step with one parameter; see `learner.steps.rounded_adam`."""
-        # Not above: it imports numba, for which processes that make no steps need not wait.
-        from learner.steps.rounded_adam import step_rounded
+        """Makes the step with one parameter, by our own kernel.
 
-        step_rounded(self, parameter, gradients, rounded)
+        Args:
+            parameter: f32[...], contiguous.
+            gradients: bf16, of the same shape.
+            rounded: bf16, of the same shape; gets what the parameter has become.
+        """
+        # Not above: they import numba, for which processes that make no steps need not wait.
+        from learner.steps.factors import as_array
+        from learner.steps.rounded_adam import adam_step
+
+        state, (beta1, beta2) = self.state[parameter], self._betas
+        n_steps = state["step"].add_(1.0).item()
+        adam_step(
+            parameter.view(-1).numpy(),
+            as_array(gradients.view(-1)),
+            state["exp_avg"].view(-1).numpy(),
+            state["exp_avg_sq"].view(-1).numpy(),
+            as_array(rounded.view(-1)),
+            np.float32(beta1),
+            np.float32(beta2),
+            np.float32(self._learning_rate / (1.0 - beta1**n_steps)),
+            np.float32(1.0 / math.sqrt(1.0 - beta2**n_steps)),
+            np.float32(self._epsilon),
+        )
 
     @torch.no_grad()
     def step(self) -> None:
@@ -80,11 +100,11 @@ class FusedAdam:
             fused=True,
             capturable=steps[0][0].device.type == "cuda",
             amsgrad=False,
-            beta1=self.betas[0],
-            beta2=self.betas[1],
-            lr=self.learning_rate,
+            beta1=self._betas[0],
+            beta2=self._betas[1],
+            lr=self._learning_rate,
             weight_decay=0.0,
-            eps=self.epsilon,
+            eps=self._epsilon,
             maximize=False,
         )
 

@@ -34,7 +34,6 @@ from learner.steps.factors import Factors, compiled
 POINTS = 4
 """n: inputs of a tile along each axis."""
 
-
 _HALF, _LOW, _ONE = np.uint32(16), np.uint32(0x7FFF), np.uint32(1)
 """Of bfloat16: how many bits fewer it has, the most of them that round down, and the last kept."""
 _A_HALF, _NOTHING = np.float32(0.5), np.float32(0.0)
