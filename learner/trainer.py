@@ -347,5 +347,5 @@ def _make_steps(
             from learner.steps.product_steps import ProductEvaluation, ProductSteps
 
             factors = torch.bfloat16 if path == "winograd-bf16" else torch.float32
-            # Teaching signals are float32, and so is all that they are computed from.
-            return ProductSteps(network, optimiser, memory, factors), ProductEvaluation(network)
+            steps = ProductSteps(network, optimiser, memory, factors)
+            return steps, ProductEvaluation(network, factors)

@@ -20,7 +20,8 @@ numba keeps what it has compiled until the file of that function changes. What s
 must therefore be in the same file, or it would go on calling what was there before.
 """
 
-Factors = NDArray[np.float32] | NDArray[np.uint16]
+Floats = NDArray[np.float32]
+Factors = Floats | NDArray[np.uint16]
 """Numbers of float32, or of bfloat16 as u16."""
 
 

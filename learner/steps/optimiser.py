@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.optim.adam import adam
 
 from broker_config.errors import StorageError
 from broker_config.preset import OptimiserPreset
@@ -90,21 +89,21 @@ class FusedAdam:
         steps = [(it, it.grad, self.state[it]) for it in self._parameters if it.grad is not None]
         if not steps:
             return
-        adam(
+        counts = [state["step"] for _, _, state in steps]
+        torch._foreach_add_(counts, 1)
+        torch._fused_adam_(
             [parameter for parameter, _, _ in steps],
             [gradient for _, gradient, _ in steps],
             [state["exp_avg"] for _, _, state in steps],
             [state["exp_avg_sq"] for _, _, state in steps],
             [],
-            [state["step"] for _, _, state in steps],
-            fused=True,
-            capturable=steps[0][0].device.type == "cuda",
-            amsgrad=False,
+            counts,
+            lr=self._learning_rate,
             beta1=self._betas[0],
             beta2=self._betas[1],
-            lr=self._learning_rate,
             weight_decay=0.0,
             eps=self._epsilon,
+            amsgrad=False,
             maximize=False,
         )
 

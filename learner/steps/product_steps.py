@@ -57,9 +57,8 @@ class ProductSteps:
             hidden = trunk.forward(self._memory.ring.index_select(0, positions[batch]))
             self._optimiser.zero_grad()
             losses[step] = self._head_step(hidden, actions[batch], targets[batch])
-            trunk.backward([units.grad for units in hidden])
+            trunk.backward([units.grad for units in hidden], self._optimiser)
             self._optimiser.step()
-            trunk.step_rounded(self._optimiser)
         return losses
 
     def _head_step(self, hidden: list[Tensor], actions: Tensor, targets: Tensor) -> Tensor:
@@ -72,16 +71,17 @@ class ProductSteps:
 
 
 class ProductEvaluation:
-    """Computes preferences by matrix products of float32; equals the network up to rounding."""
+    """Computes preferences as steps do; equals the network up to rounding."""
 
-    def __init__(self, network: PreferenceNetwork) -> None:
+    def __init__(self, network: PreferenceNetwork, factors: torch.dtype) -> None:
         """Allocates what it needs.
 
         Args:
             network: On the CPU, in the layout that `build_network` gives.
+            factors: What is multiplied: float32 or bfloat16.
         """
         self._network = network
-        self._trunk = _Trunk(network, EVALUATED_AT_ONCE, torch.float32)
+        self._trunk = _Trunk(network, EVALUATED_AT_ONCE, factors)
 
     @torch.no_grad()
     def __call__(self, pictures: Tensor) -> Tensor:
@@ -91,6 +91,7 @@ class ProductEvaluation:
             pictures: u8[n, H, W, C].
         """
         preferences = []
+        self._trunk.follow()
         for part in torch.split(pictures, EVALUATED_AT_ONCE):
             missing = EVALUATED_AT_ONCE - len(part)
             full = (
@@ -116,11 +117,6 @@ class _Trunk:
         for layer in self._hidden:
             layer.follow()
 
-    def step_rounded(self, optimiser: FusedAdam) -> None:
-        """Makes the steps of all parameters to which `backward` gives no gradients."""
-        for layer in self._hidden:
-            layer.step_rounded(optimiser)
-
     @torch.no_grad()
     def forward(self, pictures: Tensor) -> list[Tensor]:
         """Hidden units f32[B, 512] of each stream, as leaves of the head's graph.
@@ -132,11 +128,16 @@ class _Trunk:
         return [layer.forward().requires_grad_() for layer in self._hidden]
 
     @torch.no_grad()
-    def backward(self, unit_gradients: list[Tensor | None]) -> None:
-        """Leaves the gradients of the loss at parameters; see `step_rounded` for the others."""
+    def backward(self, unit_gradients: list[Tensor | None], optimiser: FusedAdam) -> None:
+        """Leaves the gradients of the loss at the parameters, or has made their steps.
+
+        Args:
+            unit_gradients: Of the loss by what `forward` gave.
+            optimiser: Makes the steps of rounded weights, whose gradients are still near then.
+        """
         for number, (layer, gradients) in enumerate(zip(self._hidden, unit_gradients, strict=True)):
             assert gradients is not None
-            layer.backward(gradients, self._feature_gradients, accumulate=number > 0)
+            layer.backward(gradients, self._feature_gradients, optimiser, accumulate=number > 0)
         self._convolutions.backward(self._feature_gradients)
 
 
@@ -163,30 +164,36 @@ class _Hidden:
 
     def forward(self) -> Tensor:
         """max(0, x W' + b) of the features, f32[B, 512]."""
-        sums = torch.mm(self._features, self._factors.t())
-        self._units = torch.add(sums, self._layer.bias).relu_()
+        # Weights first: the other way round they would be reordered for the product.
+        sums = torch.mm(self._factors, self._features.t())
+        self._units = torch.add(sums.t(), self._layer.bias).relu_()
         return self._units.detach()
 
-    def backward(self, gradients: Tensor, feature_gradients: Tensor, *, accumulate: bool) -> None:
-        """Leaves the parameters' gradients, and adds or writes those of the features.
+    def backward(
+        self,
+        gradients: Tensor,
+        feature_gradients: Tensor,
+        optimiser: FusedAdam,
+        *,
+        accumulate: bool,
+    ) -> None:
+        """Leaves the parameters' gradients, or makes their steps; gives those of the features.
 
         Args:
             gradients: Of the loss by what `forward` gave.
             feature_gradients: [B, I].
+            optimiser: Makes the step of rounded weights.
             accumulate: Whether to add to them.
         """
         passed = gradients.masked_fill(self._units == 0, 0.0)
         self._layer.bias.grad = torch.sum(passed, 0, out=self._bias_gradients)
         passed = passed.to(self._factors.dtype)
-        torch.mm(passed.t(), self._features, out=self._weight_gradients)
-        if self._is_exact:
-            self._layer.weight.grad = self._weight_gradients
         if accumulate:
             feature_gradients.addmm_(passed, self._factors)
         else:
             torch.mm(passed, self._factors, out=feature_gradients)
-
-    def step_rounded(self, optimiser: FusedAdam) -> None:
-        """See `_Trunk.step_rounded`."""
-        if not self._is_exact:
+        torch.mm(passed.t(), self._features, out=self._weight_gradients)
+        if self._is_exact:
+            self._layer.weight.grad = self._weight_gradients
+        else:
             optimiser.step_rounded(self._layer.weight, self._weight_gradients, self._factors)

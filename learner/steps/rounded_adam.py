@@ -5,11 +5,8 @@ gradient is widened before, and no weight is rounded after it.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from learner.steps.factors import Factors, compiled
-
-Floats = NDArray[np.float32]
+from learner.steps.factors import Factors, Floats, compiled
 
 _HALF, _LOW, _ONE = np.uint32(16), np.uint32(0x7FFF), np.uint32(1)
 

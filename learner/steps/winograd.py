@@ -1,6 +1,6 @@
 """The network's convolutions by Winograd's algorithm: the same results by fewer multiplications.
 
-Of the multiplications of a step it leaves about a half; `winograd_kernels` tells how. Those that
+Of the multiplications of a step it leaves about a half; `winograd_pictures` tells how. Those that
 are left are matrix products again, 16 at a time, and torch makes them: of float32, or of factors
 that are rounded to bfloat16 right before. A few pictures at a time go through all layers, so that
 what one leaves is still near the processor when the next one reads it.
@@ -9,26 +9,25 @@ what one leaves is still near the processor when the next one reads it.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from actors.networks import PreferenceNetwork
-from learner.steps.factors import as_array
-from learner.steps.winograd_kernels import (
+from learner.steps.factors import Factors, Floats, as_array
+from learner.steps.winograd_pictures import (
     POINTS,
     Tiling,
-    add_input_gradients,
-    fold_pictures,
-    maps_from_features,
-    maps_to_features,
-    transform_inputs,
-    transform_output_gradients,
-    transform_outputs,
-    transform_weight_gradients,
-    transform_weights,
+    feature_gradients_to_points,
+    pictures_to_points,
+    unit_gradients_to_points,
+    units_to_features,
+    units_to_points,
 )
+from learner.steps.winograd_weights import weight_gradients_from_points, weights_to_points
 
 _PICTURES_AT_ONCE = 32
 """Fewer would be nearer still, but products of few rows are slow."""
@@ -53,7 +52,10 @@ class WinogradConvolutions:
         self._layers = _layers(network, factors)
         self.features = torch.empty((batch_size, self._layers[-1].n_outputs), dtype=factors)
         sizes = [len(part) for part in torch.split(self.features, _PICTURES_AT_ONCE)]
-        scratch = _Scratch(self._layers, max(sizes), factors)
+        products = max(
+            POINTS**2 * it.tiling.n_tiles * it.weights.bias.numel() for it in self._layers
+        )
+        scratch = torch.empty(max(sizes) * products, dtype=factors)
         self._parts = [_Part(self._layers, size, scratch) for size in sizes]
 
     def forward(self, pictures: Tensor) -> None:
@@ -123,109 +125,91 @@ def _layers(network: PreferenceNetwork, factors: torch.dtype) -> list[_Layer]:
     return layers
 
 
-class _Scratch:
-    """Memory that all layers and all parts of a minibatch use in turn."""
-
-    def __init__(self, layers: list[_Layer], n_pictures: int, factors: torch.dtype) -> None:
-        products = max(
-            POINTS**2 * it.tiling.n_down * it.tiling.n_across * it.weights.bias.numel()
-            for it in layers
-        )
-        maps = max(max(math.prod(it.inputs), it.n_outputs) for it in layers)
-        self._products = torch.empty(n_pictures * products, dtype=factors)
-        self._gradients = torch.empty(n_pictures * maps)
-
-    def products(self, *shape: int) -> Tensor:
-        """For the outputs of tiles at their points, and then for their gradients."""
-        return self._products[: math.prod(shape)].view(shape)
-
-    def gradients(self, shape: torch.Size) -> Tensor:
-        """For those by what lies between two layers; each layer takes some and leaves some."""
-        return self._gradients[: shape.numel()].view(shape)
-
-
-class _Maps:
-    """What lies between two layers.
-
-    Attributes:
-        values: f32[b, rows, columns * C], zero where only tiles reach.
-        gradients: Of the loss by the values, in scratch memory.
-        n_channels: C.
-    """
-
-    def __init__(self, n_pictures: int, size: tuple[int, int, int], scratch: _Scratch) -> None:
-        rows, columns, self.n_channels = size
-        values = torch.zeros((n_pictures, rows, columns * self.n_channels))
-        self.values = values.numpy()
-        self.gradients = scratch.gradients(values.shape).numpy()
-
-
 class _Part:
     """Some pictures of a minibatch on their way through all layers."""
 
-    def __init__(self, layers: list[_Layer], n_pictures: int, scratch: _Scratch) -> None:
-        last = layers[-1]
-        sizes = [it.inputs for it in layers]
-        sizes.append((*last.tiling.outputs, last.weights.bias.numel()))
-        maps = [_Maps(n_pictures, size, scratch) for size in sizes]
-        self._first, self._last = maps[0], maps[-1]
+    def __init__(self, layers: list[_Layer], n_pictures: int, scratch: Tensor) -> None:
+        rows, columns, channels = layers[0].inputs
+        self._blocks = np.zeros((1, rows, columns * channels), np.float32)
+        sizes = [it.inputs for it in layers[1:]]
+        sizes.append((*layers[-1].tiling.outputs, layers[-1].weights.bias.numel()))
         self._convolutions = [
-            _Convolution(layer, inputs, outputs, scratch)
-            for layer, inputs, outputs in zip(layers, maps, maps[1:], strict=False)
+            _Convolution(layer, n_pictures, size, scratch)
+            for layer, size in zip(layers, sizes, strict=True)
         ]
 
     def forward(self, pictures: Tensor, features: Tensor) -> None:
         """See `WinogradConvolutions.forward`."""
-        fold_pictures(pictures.numpy(), self._first.n_channels, self._first.values)
-        for convolution in self._convolutions:
-            convolution.forward()
-        maps_to_features(self._last.values, self._last.n_channels, as_array(features))
+        first, last = self._convolutions[0], self._convolutions[-1]
+        pictures_to_points(pictures.numpy(), first.tiling, self._blocks, as_array(first.x))
+        for here, following in pairwise(self._convolutions):
+            here.multiply()
+            units_to_points(*here.units_at_points, following.tiling, as_array(following.x))
+        last.multiply()
+        units_to_features(*last.units_at_points, as_array(features))
 
     def backward(self, gradients: Tensor) -> None:
         """See `WinogradConvolutions.backward`; adds to the gradients of the weights."""
-        maps_from_features(as_array(gradients), self._last.n_channels, self._last.gradients)
-        for convolution in reversed(self._convolutions[1:]):
-            convolution.backward()
-            convolution.give_input_gradients()
-        self._convolutions[0].backward()
+        last = self._convolutions[-1]
+        feature_gradients_to_points(as_array(gradients), *last.gradients_at_points)
+        for here, before in pairwise(reversed(self._convolutions)):
+            here.add_weight_gradients()
+            here.multiply_back()
+            unit_gradients_to_points(as_array(here.x), here.tiling, *before.gradients_at_points)
+        self._convolutions[0].add_weight_gradients()
 
 
 class _Convolution:
-    """A layer, for some pictures."""
+    """A layer, for some pictures.
 
-    def __init__(self, layer: _Layer, inputs: _Maps, outputs: _Maps, scratch: _Scratch) -> None:
-        self._weights, self._tiling = layer.weights, layer.tiling
-        self._inputs, self._outputs = inputs, outputs
+    Attributes:
+        tiling: Of its outputs.
+        x: [16, T, I], inputs of the tiles at their points; after `multiply_back` their gradients.
+    """
+
+    def __init__(
+        self, layer: _Layer, n_pictures: int, units: tuple[int, int, int], scratch: Tensor
+    ) -> None:
+        """Allocates what is kept of the pictures.
+
+        Args:
+            layer: Which.
+            n_pictures: How many.
+            units: Rows, columns and channels of its units, with those that only tiles reach.
+            scratch: Memory that all layers and all parts of a minibatch use in turn.
+        """
+        self._weights, self.tiling = layer.weights, layer.tiling
         _, n_outputs, n_inputs = layer.weights.transformed.shape
-        n_tiles = len(inputs.values) * layer.tiling.n_down * layer.tiling.n_across
-        # Inputs and outputs of the tiles at their points; in `backward`, gradients.
-        factors = layer.weights.transformed.dtype
-        self._x = torch.empty((POINTS**2, n_tiles, n_inputs), dtype=factors)
-        self._y = scratch.products(POINTS**2, n_tiles, n_outputs)
-        self._plain_x, self._plain_y = as_array(self._x), as_array(self._y)
+        n_tiles = n_pictures * layer.tiling.n_tiles
+        self.x = torch.empty((POINTS**2, n_tiles, n_inputs), dtype=scratch.dtype)
+        # Outputs of the tiles at their points; in `backward`, gradients.
+        self._y = scratch[: POINTS**2 * n_tiles * n_outputs].view(POINTS**2, n_tiles, n_outputs)
+        rows, columns, channels = units
+        self._units = np.zeros((n_pictures, rows, columns * channels), np.float32)
+        self._passed = np.empty((1, *self._units.shape[1:]), np.float32)
 
-    def forward(self) -> None:
-        """Gives the outputs' values from those of the inputs."""
-        transform_inputs(self._inputs.values, self._tiling, self._plain_x)
-        torch.bmm(self._x, self._weights.transformed.mT, out=self._y)
-        bias = self._weights.bias.numpy()
-        transform_outputs(self._plain_y, bias, self._tiling, self._outputs.values)
+    @property
+    def units_at_points(self) -> tuple[Factors, Floats, Tiling, Floats]:
+        """What its units are made of, and where they go."""
+        return as_array(self._y), self._weights.bias.numpy(), self.tiling, self._units
 
-    def backward(self) -> None:
-        """Adds to the parameters' gradients, given those of the outputs."""
-        transform_output_gradients(
-            self._outputs.gradients,
-            self._outputs.values,
-            self._tiling,
-            self._plain_y,
-            self._weights.bias_gradients.numpy(),
-        )
-        self._weights.add_gradients(self._y, self._x)
+    @property
+    def gradients_at_points(self) -> tuple[Floats, Floats, Tiling, Factors, Floats]:
+        """Its units, room for a picture's gradients by them, and where these go."""
+        bias_gradients = self._weights.bias_gradients.numpy()
+        return self._units, self._passed, self.tiling, as_array(self._y), bias_gradients
 
-    def give_input_gradients(self) -> None:
-        """Gives the inputs' gradients; `backward` was before."""
-        torch.bmm(self._y, self._weights.transformed, out=self._x)
-        add_input_gradients(self._plain_x, self._tiling, self._inputs.gradients)
+    def multiply(self) -> None:
+        """The products, from the inputs at their points."""
+        torch.bmm(self.x, self._weights.transformed.mT, out=self._y)
+
+    def multiply_back(self) -> None:
+        """The inputs' gradients at their points, from the outputs'."""
+        torch.bmm(self._y, self._weights.transformed, out=self.x)
+
+    def add_weight_gradients(self) -> None:
+        """The weights' gradients, from the outputs' at their points."""
+        self._weights.add_gradients(self._y, self.x)
 
 
 class _Weights:
@@ -247,17 +231,18 @@ class _Weights:
         self.transformed = torch.empty((POINTS**2, n_outputs, stride**2 * channels), dtype=factors)
         self._product = torch.empty_like(self.transformed)
         self._sums = torch.empty(self.transformed.shape)
+        self._is_first = True
         self.bias = layer.bias.detach()
         self.bias_gradients = torch.zeros_like(self.bias)
 
     def follow(self) -> None:
         """Follows the parameter."""
         weights = self._by_block(self._layer.weight.detach())
-        transform_weights(weights.numpy(), as_array(self.transformed))
+        weights_to_points(weights.numpy(), as_array(self.transformed))
 
     def forget_gradients(self) -> None:
         """Begins a minibatch."""
-        self._sums.zero_()
+        self._is_first = True
         self.bias_gradients.zero_()
 
     def add_gradients(self, output_gradients: Tensor, inputs: Tensor) -> None:
@@ -268,11 +253,15 @@ class _Weights:
             inputs: [16, T, I].
         """
         torch.bmm(output_gradients.mT, inputs, out=self._product)
-        self._sums.add_(self._product)
+        if self._is_first:
+            self._sums.copy_(self._product)
+        else:
+            self._sums.add_(self._product)
+        self._is_first = False
 
     def set_gradients(self) -> None:
         """Leaves the sums at the parameters."""
-        transform_weight_gradients(self._sums.numpy(), self._by_block(self._gradients).numpy())
+        weight_gradients_from_points(self._sums.numpy(), self._by_block(self._gradients).numpy())
         self._layer.weight.grad, bias = self._gradients, self._layer.bias
         assert bias is not None
         bias.grad = self.bias_gradients

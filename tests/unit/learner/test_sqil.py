@@ -126,7 +126,7 @@ def run_once(program: Callable[[], None]) -> Callable[[], None]:
 def test_its_teaching_signal_is_that_of_soft_q_learning(
     episode: Callable[..., Trajectory],
 ) -> None:
-    trainer = begun(preset_with("algorithm.eta=2.0"), episode)
+    trainer = begun(preset_with("algorithm.eta=2.0"), episode, path="reference")
     add_own(trainer, episode(0, 5))
     with torch.no_grad():
         after = soft_value(trainer._network(trainer.memory.states_after()), 2.0)

@@ -186,20 +186,49 @@ def test_steps_follow_the_reference(
 @pytest.mark.parametrize("n_pictures", [1, 64, 100])
 def test_preferences_are_those_of_the_network(n_pictures: int) -> None:
     network, memory = network_of("dueling-penalty", (47, 61, 3)), filled_memory((47, 61, 3))
-    steps = ProductSteps(
-        network,
-        build_optimiser(OptimiserPreset("adam", 1e-3, 1e-8), network),
-        memory,
-        torch.float32,
-    )
-    evaluate = ProductEvaluation(network)
-    generator = torch.Generator().manual_seed(4)
-    pictures = torch.randint(256, (n_pictures, 47, 61, 3), generator=generator, dtype=torch.uint8)
+    steps = steps_of(network, memory, torch.float32)
+    evaluate = ProductEvaluation(network, torch.float32)
+    pictures = some_pictures(n_pictures, (47, 61, 3))
     for _ in range(2):  # nothing of other pictures or weights is left
         with torch.no_grad():
             expected = network(pictures)
         torch.testing.assert_close(evaluate(pictures), expected, rtol=1e-4, atol=1e-5)
         steps.run(BATCH.unsqueeze(0), TARGETS)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_preferences_round_hardly_worse_than_mixed_precision_of_torch(head: Head) -> None:
+    network, memory = network_of(head, (84, 84, 1)), filled_memory((84, 84, 1))
+    steps, pictures = steps_of(network, memory, torch.bfloat16), some_pictures(100, (84, 84, 1))
+    evaluate = ProductEvaluation(network, torch.bfloat16)
+    for _ in range(2):
+        with torch.no_grad():
+            exact = network(pictures)
+            with torch.autocast("cpu", torch.bfloat16):
+                by_torch = network(pictures)
+        # Of the head, which torch rounds too, products are float32: the error may be much smaller.
+        assert relative_error(evaluate(pictures), exact) < 1.5 * relative_error(by_torch, exact)
+        steps.run(BATCH.unsqueeze(0), TARGETS)
+
+
+@pytest.mark.parametrize("factors", [torch.float32, torch.bfloat16])
+def test_there_is_nothing_to_learn_from_ones_own_preferences(factors: torch.dtype) -> None:
+    """Teaching signals are rounded as what learns from them is."""
+    network, memory = network_of("plain", (84, 84, 1)), filled_memory((84, 84, 1))
+    rows = memory.ring[memory.ring_positions]
+    own = ProductEvaluation(network, factors)(rows).gather(1, memory.samples.actions.unsqueeze(1))
+    _, loss = gradients_by_products(network, memory, LARGE_BATCH, own.squeeze(1), factors)
+    assert loss < 1e-10
+
+
+def steps_of(network: PreferenceNetwork, memory: LocalMemory, factors: torch.dtype) -> ProductSteps:
+    optimiser = build_optimiser(OptimiserPreset("adam", 1e-3, 1e-8), network)
+    return ProductSteps(network, optimiser, memory, factors)
+
+
+def some_pictures(n: int, shape: tuple[int, int, int]) -> Tensor:
+    generator = torch.Generator().manual_seed(4)
+    return torch.randint(256, (n, *shape), generator=generator, dtype=torch.uint8)
 
 
 def trained(asked: Compute) -> Trainer:
@@ -224,7 +253,7 @@ def test_a_network_that_has_diverged_shows_it(factors: torch.dtype) -> None:
         network.convolutions[0].get_parameter("weight").fill_(torch.nan)
     _, loss = gradients_by_products(network, memory, BATCH, TARGETS, factors)
     assert math.isnan(loss)
-    assert ProductEvaluation(network)(memory.ring[:3]).isnan().all()
+    assert ProductEvaluation(network, factors)(memory.ring[:3]).isnan().all()
 
 
 @pytest.mark.parametrize("path", ["winograd", "winograd-bf16"])
