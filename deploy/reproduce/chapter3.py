@@ -199,9 +199,9 @@ CHAPTER_3: Final = (
         ),
         notes=(
             *_TWO_EPOCHS_NOTES,
-            "A path changes the rounding of each step, and nothing else; but the first action that "
-            "comes out otherwise changes all that follows, so that the runs of one seed part, and "
-            "only what seeds have in common can be compared.",
+            "A path changes the rounding of steps and of values, and nothing else; but the first "
+            "action that comes out otherwise changes all that follows, so that runs of one seed "
+            "part, and only what seeds have in common can be compared.",
         ),
     ),
     Experiment(

@@ -94,11 +94,7 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
         runs = panel_runs.runs[condition.name]
         if not runs:
             continue
-        demonstrated += [
-            first.training_return
-            for run in runs
-            if (first := run.points[0]).iteration == 0 and first.training_return is not None
-        ]
+        demonstrated += [its for run in runs if (its := run.demonstrated_return) is not None]
         samples, curves = _curves(runs, measure)
         if not samples:
             continue  # what was cloned has no value function

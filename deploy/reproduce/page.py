@@ -117,13 +117,14 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
         cells += mean_and_interval([run.greedy_returns[-1] for run in runs], "{:.2f}")
         if looks_at_success:
             cells += mean_and_interval([run.greedy_successes[-1] for run in runs], "{:.0%}")
-        minutes = np.mean([sum(it.secs for it in run.points) for run in runs]) / 60
+        # Of each iteration the median over runs: what stood still for a while counts for little.
+        secs = np.median([[point.secs for point in run.points] for run in runs], axis=0)
         last = runs[0].points[-1]
         cells += [
             "" if condition.start in CLONED else f"{_mean(panel_runs.areas(condition)):.2f}",
             str(last.samples),
             str(last.gradient_steps),
-            f"{minutes:.1f}",
+            f"{secs.sum() / 60:.1f}",
         ]
         rows.append(cells)
     return table(header, rows)
@@ -139,6 +140,10 @@ def _differences_table(panel_runs: PanelRuns) -> str:
         if (difference := panel_runs.difference(other)) is not None:
             what = ", last policies" if other.start in CLONED else ", areas"
             label = f"{panel_runs.subject.label} - {other.label}{what}"
+            rows.append(difference_row(label, difference))
+    for condition in panel_runs.panel.conditions:
+        if (difference := panel_runs.above_demonstrations(condition)) is not None:
+            label = f"{condition.label} - its demonstrations, last return"
             rows.append(difference_row(label, difference))
     return table(["difference", *DIFFERENCE_HEADER], rows) if rows else ""
 

@@ -51,6 +51,17 @@ class PanelRuns:
             return None
         return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
 
+    def above_demonstrations(self, condition: Condition) -> PairedDifference | None:
+        """The last policy's return minus the mean return of what was demonstrated to it."""
+        pairs = [
+            (run.greedy_returns[-1], demonstrated)
+            for run in self.runs[condition.name]
+            if (demonstrated := run.demonstrated_return) is not None
+        ]
+        if not pairs:
+            return None
+        return paired_difference([its for its, _ in pairs], [theirs for _, theirs in pairs])
+
 
 def sort_runs(
     experiment: Experiment, runs: Sequence[FinishedRun], scores: Sequence[StoredScore] = ()

@@ -120,6 +120,12 @@ class FinishedRun:
         """Of the policy after each update."""
         return [value for point in self.points for value in point.greedy_successes]
 
+    @property
+    def demonstrated_return(self) -> float | None:
+        """Mean of what was demonstrated to it in whole episodes; None if nothing was."""
+        first = self.points[0]
+        return first.training_return if first.iteration == 0 else None
+
 
 def finish_runs(
     plans: Sequence[RunPlan],

@@ -22,6 +22,9 @@ _PATHS: dict[str, tuple[TrainingPath, ...]] = {
 multiplies numbers of bfloat16 it is `winograd-bf16`."""
 
 
+_REVISIONS: dict[TrainingPath, int] = {"winograd": 2, "winograd-bf16": 2}
+"""How often a path's arithmetic has been another; raised with whatever changes its bits."""
+
 EVALUATED_AT_ONCE = 64
 """Pictures of which paths that keep buffers compute preferences at a time."""
 
@@ -69,7 +72,7 @@ class Compute:
             StorageError: Another path was asked for, or another device; or this version has no such
                 path.
         """
-        if begun.partition(" ")[0] not in get_args(TrainingPath):
+        if begun.partition(" on ")[0] not in map(_steps_of, get_args(TrainingPath)):
             raise StorageError(
                 f"expected to go on by {begun}, as it was begun; got a version of clothbus without "
                 "it; go on with the version that began it, or begin anew"
@@ -84,7 +87,12 @@ class Compute:
         )
 
     def __str__(self) -> str:
-        return f"{self.chosen_path} steps on {self.device}"
+        return f"{_steps_of(self.chosen_path)} on {self.device}"
+
+
+def _steps_of(path: TrainingPath) -> str:
+    revision = _REVISIONS.get(path, 1)
+    return f"{path} steps" if revision == 1 else f"{path} steps of revision {revision}"
 
 
 @cache

@@ -12,13 +12,12 @@ from torch import Tensor
 
 from actors.compiled import compiler
 
-# Without Python's lock, so that the learner's other threads need not wait.
-compiled: Any = compiler(nogil=True, error_model="numpy", fastmath={"contract"})
-"""Compiles the loops of a gradient step.
 
-numba keeps what it has compiled until the file of that function changes. What such a function calls
-must therefore be in the same file, or it would go on calling what was there before.
-"""
+def steps_compiler(*used: str) -> Any:
+    """Compiles the loops of a gradient step; see `actors.compiled.compiler`."""
+    # Without Python's lock, so that the learner's other threads need not wait.
+    return compiler(*used, nogil=True, error_model="numpy", fastmath={"contract"})
+
 
 Floats = NDArray[np.float32]
 Factors = Floats | NDArray[np.uint16]

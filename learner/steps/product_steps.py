@@ -1,9 +1,9 @@
 """The gradient steps on a CPU, written as matrix products into buffers that are kept.
 
 Hardly anything is allocated or reordered in a step. Only the head, which is small and has three
-forms, is left to autograd, in float32. Parameters, teaching signals and the optimiser's state are
-float32, too. Of the layers below the head, all that goes into a product and all that comes out of
-one may be bfloat16; what is added up or transformed in between is float32.
+forms, is left to autograd, in float32. Parameters and the optimiser's state are float32, too. Of
+the layers below the head, all that goes into a product and all that comes out of one may be
+bfloat16; what is added up or transformed in between is float32.
 """
 
 from __future__ import annotations
@@ -144,8 +144,8 @@ class _Trunk:
 class _Hidden:
     """A fully connected layer on the features, and the ReLU after it.
 
-    Most of a network's weights are here. If they are rounded, they and their gradients are so once
-    in a step, by the optimiser, which passes over them anyway.
+    Most of a network's weights are here. If they are rounded, they are so once in a step, by the
+    optimiser, which passes over them anyway.
     """
 
     def __init__(self, layer: nn.Linear, features: Tensor) -> None:

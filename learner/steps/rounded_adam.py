@@ -6,12 +6,12 @@ gradient is widened before, and no weight is rounded after it.
 
 import numpy as np
 
-from learner.steps.factors import Factors, Floats, compiled
+from learner.steps.factors import Factors, Floats, steps_compiler
 
 _HALF, _LOW, _ONE = np.uint32(16), np.uint32(0x7FFF), np.uint32(1)
 
 
-@compiled  # type: ignore[untyped-decorator] # numba publishes no types
+@steps_compiler()  # type: ignore[untyped-decorator] # numba publishes no types
 def adam_step(
     parameter: Floats,
     gradients: Factors,

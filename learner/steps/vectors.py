@@ -2,9 +2,6 @@
 
 What numba makes of a loop over a few channels is mostly questions: how often it goes round, which
 arrays overlap. With vectors there is nothing to ask.
-
-numba does not notice when this file changes: after an edit delete the `.nbi` files beside the
-modules that use it.
 """
 
 from __future__ import annotations
@@ -19,7 +16,10 @@ from numba.core import types
 from numba.core.errors import TypingError
 from numba.extending import models, overload, register_model
 
-from learner.steps.factors import compiled
+from learner.steps.factors import steps_compiler
+
+compiled: Any = steps_compiler(__file__)
+"""Compiles what uses vectors."""
 
 LANES = 16
 """Numbers of a vector. Where a processor's registers are smaller, it takes several of them."""

@@ -33,10 +33,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.steps.factors import Factors, Floats, compiled
+from learner.steps.factors import Factors, Floats
 from learner.steps.vectors import (
     LANES,
     add_four,
+    compiled,
     load,
     load_four,
     load_three,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from learner.steps.factors import Factors, Floats, compiled
-from learner.steps.vectors import LANES, load, store
+from learner.steps.factors import Factors, Floats
+from learner.steps.vectors import LANES, compiled, load, store
 from learner.steps.winograd_pictures import POINTS
 
 _ONE, _A_HALF = np.float32(1.0), np.float32(0.5)

@@ -38,3 +38,26 @@ def test_it_is_kept_for_the_next_process(tmp_path: Path) -> None:
     for _ in range(2):
         assert run([str(module)]) == "42"
     assert list(tmp_path.glob("__pycache__/doubling.twice-*.nbi"))
+
+
+USER = """
+import doubling
+
+from actors.compiled import compiler
+
+@compiler(doubling.__file__)
+def twice_and_one(x):
+    return doubling.twice(x) + 1
+
+print(twice_and_one(20))
+"""
+
+
+def test_it_is_made_anew_when_what_it_calls_has_changed(tmp_path: Path) -> None:
+    called, user = tmp_path / "doubling.py", tmp_path / "using.py"
+    called.write_text(PROGRAM.replace("print(twice(21))", ""))
+    user.write_text(USER)
+    for _ in range(2):
+        assert run([str(user)]) == "41"
+    called.write_text(called.read_text().replace("2 * x", "30 * x"))
+    assert run([str(user)]) == "601"

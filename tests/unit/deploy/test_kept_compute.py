@@ -26,10 +26,11 @@ def test_a_run_goes_on_by_the_path_that_it_was_begun_with(tmp_path: Path) -> Non
     assert folder.compute.read_text() == f"{Compute()}\n"
 
 
-def test_a_path_that_this_version_does_not_have_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("begun", ["products-bf16 steps on cpu", "winograd steps on cpu"])
+def test_arithmetic_that_this_version_does_not_have_is_said(tmp_path: Path, begun: str) -> None:
     folder = RunFolder(tmp_path)
-    folder.compute.write_text("products-bf16 steps on cpu\n")
-    with pytest.raises(StorageError, match=r"products-bf16 .*got a version of clothbus without it"):
+    folder.compute.write_text(f"{begun}\n")
+    with pytest.raises(StorageError, match=rf"{begun}.*got a version of clothbus without it"):
         settle_compute(folder, Compute())
 
 

@@ -79,6 +79,26 @@ def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
     assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
 
 
+def test_the_page_says_how_far_above_its_demonstrations_each_is(tmp_path: Path) -> None:
+    experiment = replace(SMOKE, panels=(Panel("2 joints", (DPN, DQN), seeds=2),))
+    made = [run_of(DPN, seed, [3.0, 4.0 + seed]) for seed in (0, 1)]
+    without = run_of(DQN, 0, [3.0, 4.0])
+    points = (replace(without.points[0], training_return=None), *without.points[1:])
+    draw(experiment, [*made, replace(without, points=points)], tmp_path, "the command")
+    page = (tmp_path / PAGE).read_text()
+    assert "| DPN - its demonstrations, last return | +1.00, +2.00 | +1.50 |" in page
+    assert "DQN - its demonstrations" not in page
+
+
+def test_a_run_that_stood_still_counts_for_little(tmp_path: Path) -> None:
+    experiment = replace(SMOKE, panels=(Panel("2 joints", (DPN,), seeds=3),))
+    made = [run_of(DPN, seed, [1.0, 2.0]) for seed in range(3)]
+    stopped = tuple(replace(point, secs=9000.0) for point in made[0].points)
+    draw(experiment, [replace(made[0], points=stopped), *made[1:]], tmp_path, "the command")
+    (row,) = (it for it in (tmp_path / PAGE).read_text().splitlines() if it.startswith("| DPN |"))
+    assert row.endswith("| 0.1 |")
+
+
 def test_one_command_leaves_numbers_figure_and_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

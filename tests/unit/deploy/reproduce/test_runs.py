@@ -128,7 +128,7 @@ def test_a_process_that_is_killed_is_said(tmp_path: Path) -> None:
 def test_a_run_does_not_go_on_by_another_path(tmp_path: Path) -> None:
     with InProcessRun(smoke_plan(), tmp_path, Compute(path="winograd")) as begun:
         next(begun.finish())
-    with pytest.raises(StorageError, match=r"go on by winograd steps on cpu.*got reference steps"):
+    with pytest.raises(StorageError, match=r"go on by winograd steps .*got reference steps"):
         InProcessRun(smoke_plan(), tmp_path, Compute(path="reference"))
 
 
@@ -139,7 +139,7 @@ def test_a_condition_may_say_by_which_path_it_learns(tmp_path: Path) -> None:
     finish_runs(plans, tmp_path / "c.jsonl", tmp_path / "work", asked, 1, iterations=1)
     assert [run.compute for run in read_runs(tmp_path / "c.jsonl")] == [
         "reference steps on cpu",
-        "winograd steps on cpu",
+        str(asked),
     ]
 
 

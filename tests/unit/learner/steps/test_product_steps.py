@@ -76,6 +76,7 @@ class Recording:
         assert torch.equal(rounded, parameter.to(torch.bfloat16))
         (name,) = (name for name, each in self._network.named_parameters() if each is parameter)
         self.gradients[name] = gradients.to(torch.float32)
+        rounded.fill_(torch.nan)  # whoever read it now would read the next step's
 
 
 def gradients_by_products(
@@ -246,6 +247,16 @@ def trained(asked: Compute) -> Trainer:
     return trainer
 
 
+@pytest.mark.parametrize(
+    ("path", "factors"), [("winograd", torch.float32), ("winograd-bf16", torch.bfloat16)]
+)
+def test_a_trainer_evaluates_as_it_makes_steps(path: str, factors: torch.dtype) -> None:
+    trainer = trained(Compute(path=path))  # type: ignore[arg-type]
+    pictures = trainer.memory.live_frames(0, trainer.memory.n_frames)
+    expected = ProductEvaluation(trainer._network, factors)(pictures)
+    assert torch.equal(trainer._evaluate_frames(), expected)
+
+
 @pytest.mark.parametrize("factors", [torch.float32, torch.bfloat16])
 def test_a_network_that_has_diverged_shows_it(factors: torch.dtype) -> None:
     network, memory = network_of("plain", (36, 36, 1)), filled_memory((36, 36, 1))
@@ -293,7 +304,7 @@ def test_a_path_is_chosen_by_what_the_processor_can_do(
     monkeypatch: pytest.MonkeyPatch, can_multiply: bool, expected: str
 ) -> None:
     monkeypatch.setattr(compute, "multiplies_bfloat16", lambda: can_multiply)
-    assert str(Compute()) == f"{expected} steps on cpu"
+    assert str(Compute()) == f"{expected} steps of revision 2 on cpu"
     assert Compute("cuda:1").chosen_path == "graphs"
     assert str(replace(Compute(), path="reference")) == "reference steps on cpu"
 
