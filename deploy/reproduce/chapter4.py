@@ -23,9 +23,9 @@ _REACHING_NOTES = (
 )
 _IMITATION_NOTES = (
     *_REACHING_NOTES,
-    "Adam instead of RMSProp, minibatches of 256 for the generator, a target switch after every "
-    "fourth of K's 20 epochs, and spectral norm in the discriminators. docs/imitation.md has what "
-    "led there, on seeds that are not reported.",
+    "Adam instead of RMSProp, a target switch after every fourth of K's 20 epochs, D_G of the "
+    "newest 900 samples instead of 3,000, and spectral norm in the discriminators. "
+    "docs/imitation.md has what led there, on seeds that are not reported.",
 )
 _REWARD_MAP_NOTES = (
     *_REACHING_NOTES,
@@ -36,7 +36,7 @@ _REWARD_MAP_NOTES = (
 _SETTINGS = (*ADAM, "schedule.target_switches=5", "schedule.epochs=4")
 _IMITATION_SETTINGS = (
     *_SETTINGS,
-    "schedule.minibatch_size=256",
+    "schedule.memory_samples=900",
     "imitation.discriminator.spectral_norm=true",
 )
 
