@@ -63,11 +63,13 @@ def test_kill_9_of_the_recorder_loses_and_doubles_nothing(start: Start, tmp_path
 def test_a_recorder_that_ends_at_each_of_its_failpoints_loses_nothing(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Each is reached however fast the run is: a recorder asks once more for what it has held, one
+    # that begins again recovers, and what was received or written but not held is to be held yet.
     points = {
-        Failpoint.BATCH_RECEIVED: 3,
-        Failpoint.BATCH_WRITTEN: 3,
+        Failpoint.BATCH_RECEIVED: 2,
         Failpoint.RECORDING_RECOVERED: 1,
-        Failpoint.BATCH_HELD: 2,
+        Failpoint.BATCH_WRITTEN: 1,
+        Failpoint.BATCH_HELD: 1,
     }
     flags = {point: tmp_path / point.value for point in points}
     armed = [f"{point}:{count}:{flags[point]}" for point, count in points.items()]
