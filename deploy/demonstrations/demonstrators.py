@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from actors.acting import UniformlyRandom, collecting_policy
 from actors.demonstrate.acting import scripted_demonstrator
@@ -16,6 +17,9 @@ from broker_config.preset import Preset
 from deploy.demonstrations.folder import DemonstrationFolder
 from deploy.demonstrations.quality import find_quality
 from deploy.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from actors.policy import Policy  # brings torch, which scripts and chance do without
 
 
 @dataclass(frozen=True)
@@ -129,12 +133,26 @@ def by_policy(preset: Preset, run: RunFolder, version: int | None = None) -> Act
             "this task"
         )
     kept = kept_policy(run, of_run, version)
-    acting = collecting_policy(of_run.algorithm, kept.policy)
-    played = SnapshotPlayed(run.run, kept.version, kept.digest, _epsilon(of_run, kept.version))
+    played = SnapshotPlayed(
+        run.run, kept.version, kept.digest, acting_epsilon(of_run, kept.version)
+    )
+    return by_snapshot(of_run, kept.policy, played)
+
+
+def by_snapshot(of_run: Preset, policy: Policy, played: SnapshotPlayed) -> ActingDemonstrator:
+    """A policy acting as it does in the run that it is of.
+
+    Args:
+        of_run: The run's preset.
+        policy: Which acts.
+        played: What is said of it.
+    """
+    acting = collecting_policy(of_run.algorithm, policy)
     return ActingDemonstrator(Demonstrator("policy", snapshot=played), lambda _: acting)
 
 
-def _epsilon(preset: Preset, version: int) -> float:
+def acting_epsilon(preset: Preset, version: int) -> float:
+    """Probability of a random action in a version's first episode; 0 for the DPN family."""
     if preset.exploration is None or not preset.algorithm.is_epsilon_greedy:
         return 0.0
     updates = version + preset.schedule.policy_lag if version else 0

@@ -12,6 +12,7 @@ from deploy.reproduce.experiment import (
     Experiment,
     KeptPolicies,
     Panel,
+    PolicyUnderTraining,
     TransferTable,
     World,
 )
@@ -152,6 +153,26 @@ def _folding_panels(placed: str, overrides: tuple[str, ...] = ()) -> tuple[Panel
     return shirt, trousers
 
 
+_LEARNING: Final = (
+    "algorithm.method=dpn",
+    "algorithm.sigma=0.0",
+    "schedule.target_switches=3",
+    "schedule.epochs=1",
+    "imitation.generator_epochs=3",
+)
+
+
+def _learned_from(updates: int) -> Panel:
+    """Imitation of a policy that is under training, as figure 4.5 has it."""
+    return Panel(
+        f"demonstrated after {updates} updates",
+        _FOUR_IMITATORS,
+        seeds=5,
+        overrides=("imitation.target_reward=-0.35",),
+        demonstrator=PolicyUnderTraining(updates, _LEARNING),
+    )
+
+
 CHAPTER_4: Final = (
     Experiment(
         name="figure-4.5",
@@ -165,7 +186,7 @@ CHAPTER_4: Final = (
         overrides=_IMITATION_SETTINGS,
         panels=(
             Panel("20 % mistakes", _FOUR_IMITATORS, seeds=5, mistake_rate=0.2),
-            Panel("40 % mistakes", _FOUR_IMITATORS, seeds=5, mistake_rate=0.4),
+            *(_learned_from(updates) for updates in (5, 11, 7, 9)),
             Panel(
                 "20 % mistakes, each discriminator alone",
                 (BID, PGAIL, TARGET_ONLY),

@@ -17,7 +17,8 @@ from deploy.reproduce.experiment import (
     TransferTable,
     with_changes,
 )
-from deploy.reproduce.runs import FinishedRun, finish_runs, finished_runs, read_runs
+from deploy.reproduce.runs import FinishedRun, finished_runs, read_runs
+from deploy.reproduce.side_by_side import finish_runs
 from learner.steps.compute import Compute, TrainingPath
 
 CURVES, SCORES, WORLDS = "curves.jsonl", "stored_states.jsonl", "worlds.jsonl"

@@ -7,16 +7,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from broker_config.errors import StorageError
-from broker_config.messages import Trajectory
-from broker_config.preset import ImitationPreset
-from deploy.demonstrations.demonstrators import by_script
+from broker_config.messages import SnapshotPlayed, Trajectory
+from broker_config.preset import ImitationPreset, Preset
+from deploy.demonstrations.demonstrators import (
+    ActingDemonstrator,
+    acting_epsilon,
+    by_script,
+    by_snapshot,
+)
 from deploy.demonstrations.making import (
     LEAST_TARGETS,
     MOST_DRAWS,
     make_demonstrations,
     preset_of_draw,
 )
+from deploy.reproduce.kept_weights import kept_policy
 from deploy.reproduce.runs import RunPlan
+from deploy.reproduce.work_folder import policy_digest, policy_file
 from discriminator.targets import target_states
 from learner.cloning import cloning_preset
 from learner.recorded import Demonstrations, first_samples
@@ -30,14 +37,15 @@ def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
         work: Folder in which they are kept.
 
     Raises:
-        StorageError: The demonstrator is so bad that no draw has enough targets.
+        StorageError: The demonstrator is so bad that no draw has enough targets, or it is a run
+            that has left no policy here.
     """
     preset, rate = plan.preset, plan.key.mistake_rate
     wanted = preset.initialisation or preset.imitation
-    if rate is None or wanted is None:
+    if wanted is None or (rate is None and plan.demonstrator is None):
         return []
     for draw in range(MOST_DRAWS):
-        played = _played(plan, work, wanted.demonstration_samples, rate, draw)
+        played = _played(plan, work, wanted.demonstration_samples, draw)
         given = list(first_samples(played, wanted.demonstration_samples).trajectories)
         if preset.imitation is None or _has_targets(given, preset.imitation):
             return given
@@ -48,7 +56,7 @@ def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
     )
 
 
-def _played(plan: RunPlan, work: Path, samples: int, rate: float, draw: int) -> Demonstrations:
+def _played(plan: RunPlan, work: Path, samples: int, draw: int) -> Demonstrations:
     """At least so many samples of the demonstrator; each draw has seeds of its own."""
     # Whatever learns from them has nothing to do with how they are made.
     neutral = replace(
@@ -57,12 +65,27 @@ def _played(plan: RunPlan, work: Path, samples: int, rate: float, draw: int) -> 
         initialisation=None,
         imitation=None,
     )
-    folder = work / "demonstrations" / f"{neutral.digest[:12]}-scripted-{rate:g}"
+    name, demonstrator = _demonstrator(plan, neutral, work)
+    folder = work / "demonstrations" / f"{neutral.digest[:12]}-{name}"
     folder.parent.mkdir(parents=True, exist_ok=True)
     episodes = -(-samples // plan.preset.task.horizon)
     with folder.with_name(f"{folder.name}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        return make_demonstrations(neutral, folder, episodes, by_script(neutral, rate))
+        return make_demonstrations(neutral, folder, episodes, demonstrator)
+
+
+def _demonstrator(plan: RunPlan, neutral: Preset, work: Path) -> tuple[str, ActingDemonstrator]:
+    """Who demonstrates to a run, and a name for what it demonstrates."""
+    if plan.demonstrator is None:
+        rate = plan.key.mistake_rate
+        assert rate is not None  # or nothing is demonstrated
+        return f"scripted-{rate:g}", by_script(neutral, rate)
+    learned, name = plan.demonstrator, plan.demonstrator.key.name
+    policy = kept_policy(work, learned)
+    version, digest = learned.preset.schedule.iterations, policy_digest(policy_file(work, learned))
+    assert digest is not None  # it has just been read
+    played = SnapshotPlayed(name, version, digest, acting_epsilon(learned.preset, version))
+    return name, by_snapshot(learned.preset, policy, played)
 
 
 def _has_targets(demonstrations: list[Trajectory], imitation: ImitationPreset) -> bool:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import load_preset
 from deploy.reproduce.runs import RunKey, RunPlan, Start
 from learner.steps.compute import TrainingPath
+
+DEMONSTRATOR: Final = "demonstrator"
+"""The condition of runs that learn to demonstrate."""
 
 Measure = Literal["greedy_returns", "greedy_successes", "relative_bellman_errors"]
 
@@ -32,6 +35,16 @@ class Condition:
 
 
 @dataclass(frozen=True)
+class PolicyUnderTraining:
+    """A demonstrator that has learned for a while, from the task's own rewards."""
+
+    updates: int
+    """After which it demonstrates."""
+    overrides: tuple[str, ...]
+    """Settings by which it learns, beside those of the panel."""
+
+
+@dataclass(frozen=True)
 class Panel:
     """Conditions that are compared with each other: one figure's axes and one table."""
 
@@ -43,6 +56,8 @@ class Panel:
     overrides: tuple[str, ...] = ()
     mistake_rate: float | None = None
     """Of its demonstrations; the experiment's if None."""
+    demonstrator: PolicyUnderTraining | None = None
+    """Who demonstrates; the task's script, with mistakes, if None."""
     preset: str | None = None
     """The experiment's if None."""
     stored_states: str | None = None
@@ -102,9 +117,34 @@ class Experiment:
         """All that determines one run."""
         preset = self.preset_of(panel, condition, seed)
         needs_none = condition.start == "untrained" and preset.imitation is None
-        rate = None if needs_none else self._mistake_rate_of(panel)
-        key = RunKey(condition.name, seed, preset.digest, condition.start, rate, self.episodes)
-        return RunPlan(key, preset, condition.path)
+        demonstrator = None if needs_none else self.demonstrator_plan(panel, seed)
+        by_script = not needs_none and demonstrator is None
+        key = RunKey(
+            condition.name,
+            seed,
+            preset.digest,
+            condition.start,
+            self._mistake_rate_of(panel) if by_script else None,
+            self.episodes,
+            None if demonstrator is None else demonstrator.key.name,
+        )
+        return RunPlan(key, preset, condition.path, demonstrator)
+
+    def demonstrator_plan(self, panel: Panel, seed: int) -> RunPlan | None:
+        """The run whose last policy demonstrates to a panel's runs of a seed.
+
+        Returns:
+            None where the task's script demonstrates.
+        """
+        if panel.demonstrator is None:
+            return None
+        made = (*self.overrides, *panel.overrides, *panel.demonstrator.overrides)
+        length = f"schedule.iterations={panel.demonstrator.updates}"
+        overrides = (*made, *self.changes, length, f"seed={seed}")
+        learned = load_preset(self.preset_name(panel), overrides)
+        preset = dataclasses.replace(learned, imitation=None, initialisation=None)
+        key = RunKey(DEMONSTRATOR, seed, preset.digest, "untrained", None, self.episodes)
+        return RunPlan(key, preset)
 
     def _mistake_rate_of(self, panel: Panel) -> float:
         return self.mistake_rate if panel.mistake_rate is None else panel.mistake_rate

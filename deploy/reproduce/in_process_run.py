@@ -25,8 +25,8 @@ from broker_config.structure import from_plain, to_plain
 from deploy.evaluation.played_episodes import sound_episode
 from deploy.evaluation.player import Player
 from deploy.reproduce.demonstrations import demonstrations_of
-from deploy.reproduce.runs import CLONED, CurvePoint, RunPlan, checkpoints_folder
-from deploy.reproduce.work_folder import discriminators_file, policy_file
+from deploy.reproduce.runs import CLONED, CurvePoint, RunPlan
+from deploy.reproduce.work_folder import checkpoints_folder, discriminators_file, policy_file
 from deploy.rewards.relabelling import relabel
 from discriminator.real_states import real_states
 from discriminator.trainer import Discriminators

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from broker_config.preset import TaskPreset
 from deploy.presets import load_preset
+from deploy.reproduce.demonstrated_section import demonstrated_returns, who_demonstrated
 from deploy.reproduce.experiment import Experiment, Measure, Panel
 from deploy.reproduce.panel_runs import PanelRuns
 from deploy.reproduce.runs import CLONED, FinishedRun
@@ -59,6 +61,7 @@ def write_page(
             continue
         parts += [
             _panel_settings(panel_runs.panel),
+            demonstrated_returns(panel_runs, _task_of(experiment, panel_runs.panel)),
             _conclusion(panel_runs),
             _scores_table(experiment, panel_runs),
             _differences_table(panel_runs),
@@ -76,6 +79,10 @@ def write_page(
 def _panel_settings(panel: Panel) -> str:
     changes = ", ".join(f"`{override}`" for override in panel.overrides)
     return f"Here {changes}." if changes else ""
+
+
+def _task_of(experiment: Experiment, panel: Panel) -> TaskPreset:
+    return experiment.preset_of(panel, panel.conditions[0], panel.first_seed).task
 
 
 def _conclusion(panel_runs: PanelRuns) -> str:
@@ -149,7 +156,6 @@ def _differences_table(panel_runs: PanelRuns) -> str:
 
 
 def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
-    runs = [run for each in panels for runs in each.runs.values() for run in runs]
     lines = [
         *_preset_lines(experiment, panels),
         f"* The area is the mean {_AREA_OF[experiment.measures[0]]} over the samples, by trapezia "
@@ -161,14 +167,7 @@ def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
     ]
     if changes := [f"`{it}`" for it in (*experiment.overrides, *experiment.changes)]:
         lines.append(f"* Changed from the preset: {', '.join(changes)}.")
-    rates = sorted({run.key.mistake_rate for run in runs if run.key.mistake_rate is not None})
-    if rates:
-        lines.append(
-            f"* Demonstrations: the task's script, {' or '.join(f'{rate:.0%}' for rate in rates)} "
-            "of its actions random, drawn anew for each seed and the same for all conditions of "
-            "it; they begin where a run's first episodes do."
-        )
-    return "\n".join(lines)
+    return "\n".join([*lines, *who_demonstrated(panels)])
 
 
 def _preset_lines(experiment: Experiment, panels: Sequence[PanelRuns]) -> list[str]:

@@ -51,6 +51,15 @@ class PanelRuns:
             return None
         return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
 
+    def demonstrated_returns(self) -> dict[int, float]:
+        """Mean return of what was demonstrated to the runs, by seed."""
+        return {
+            run.key.seed: demonstrated
+            for condition in self.panel.conditions
+            for run in self.runs[condition.name]
+            if (demonstrated := run.demonstrated_return) is not None
+        }
+
     def above_demonstrations(self, condition: Condition) -> PairedDifference | None:
         """The last policy's return minus the mean return of what was demonstrated to it."""
         pairs = [

@@ -1,11 +1,16 @@
-"""Where runs leave their weights: last policies, and the discriminators of each iteration."""
+"""Where runs leave what is too large for the repository: checkpoints and weights."""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
 
-from deploy.reproduce.runs import RunPlan
+from deploy.reproduce.runs import RunKey, RunPlan
+
+
+def checkpoints_folder(work: Path, key: RunKey) -> Path:
+    """Where an unfinished run keeps what it goes on from."""
+    return work / "checkpoints" / key.name
 
 
 def policy_file(work: Path, plan: RunPlan) -> Path:

@@ -24,11 +24,16 @@ from deploy.reproduce.chapter4 import (
     SQIL,
 )
 from deploy.reproduce.demonstrations import demonstrations_of
-from deploy.reproduce.experiment import Condition, with_changes
+from deploy.reproduce.experiment import Condition, PolicyUnderTraining, with_changes
 from deploy.reproduce.in_process_run import InProcessRun
+from deploy.reproduce.page import write_page
+from deploy.reproduce.panel_runs import sort_runs
+from deploy.reproduce.runs import read_runs
+from deploy.reproduce.side_by_side import finish_runs
 from deploy.reproduce.work_folder import policy_file
 from discriminator.real_states import real_states
 from learner.cloning import clone, cloning_preset
+from learner.steps.compute import Compute
 from learner.teaching_signal import epsilon_greedy_value, soft_value
 from tests.unit.deploy.reproduce.short_experiments import (
     IMITATION,
@@ -188,3 +193,52 @@ def test_demonstrations_to_imitate_show_enough_targets(tmp_path: Path) -> None:
     never = with_changes(IMITATION, 1, ["imitation.target_reward=0.0"])
     with pytest.raises(StorageError, match="expected at least 3 target states"):
         demonstrations_of(never.plan(never.panels[0], BID, 0), tmp_path)
+
+
+LEARNING = ("algorithm.method=dpn", "algorithm.sigma=0.0")
+TAUGHT = replace(
+    IMITATION,
+    panels=(replace(IMITATION.panels[0], demonstrator=PolicyUnderTraining(1, LEARNING)),),
+    overrides=(*IMITATION.overrides, "imitation.target_reward=-2.0"),
+)
+
+
+def test_a_policy_under_training_demonstrates_the_same_to_all_conditions(tmp_path: Path) -> None:
+    plans = [TAUGHT.plan(TAUGHT.panels[0], condition, 0) for condition in (BID, CLONING)]
+    learned = plans[0].demonstrator
+    assert learned is not None
+    assert learned == plans[1].demonstrator
+    with pytest.raises(StorageError, match=f"expected the last policy of {learned.key.name}; got"):
+        demonstrations_of(plans[0], tmp_path)
+
+    (cloned,) = finish_runs([plans[1]], tmp_path / "curves.jsonl", tmp_path, Compute(), 1, None)
+    of_demonstrator, of_clone = sorted(
+        read_runs(tmp_path / "curves.jsonl"), key=lambda run: run.key != learned.key
+    )
+    assert (of_demonstrator.key, of_demonstrator.iterations) == (learned.key, 1)
+    assert of_clone.key == cloned.key == plans[1].key
+    mine, theirs = (demonstrations_of(plan, tmp_path) for plan in plans)
+    assert [it.actions.tolist() for it in mine] == [it.actions.tolist() for it in theirs]
+    assert {it.ticket.policy_version for it in mine} == {1}
+    whole = [it.return_ for it in mine if it.steps == 30]
+    assert cloned.demonstrated_return == pytest.approx(np.mean(whole))
+
+    page = tmp_path / "README.md"
+    experiment = replace(TAUGHT, panels=(replace(TAUGHT.panels[0], conditions=(CLONING,)),))
+    write_page(page, experiment, sort_runs(experiment, [cloned]), "clothbus", "curves.png")
+    said = page.read_text()
+    assert f"Demonstrations: mean return {np.mean(whole):.2f}" in said
+    assert "1 the best that beam search finds" in said
+    assert "demonstrates after 1 updates" in said
+    assert "the task's script" not in said
+
+
+def test_a_demonstrator_whose_policy_is_not_here_learns_again(tmp_path: Path) -> None:
+    plan = TAUGHT.plan(TAUGHT.panels[0], CLONING, 0)
+    assert plan.demonstrator is not None
+    curves, made = tmp_path / "curves.jsonl", []
+    for work in (tmp_path / "here", tmp_path / "elsewhere"):
+        finish_runs([plan], curves, work, Compute(), 1, None, anew={plan.key})
+        made.append(policy_file(work, plan.demonstrator).read_bytes())
+    assert made[0] == made[1]
+    assert len(read_runs(curves)) == 2

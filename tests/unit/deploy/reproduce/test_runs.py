@@ -14,14 +14,9 @@ from broker_config.errors import StorageError
 from deploy.reproduce.chapter3 import DPN, DQN, DUELING_DPN, SUPERVISED
 from deploy.reproduce.experiment import Condition, with_changes
 from deploy.reproduce.in_process_run import InProcessRun
-from deploy.reproduce.runs import (
-    RunPlan,
-    checkpoints_folder,
-    finish_runs,
-    read_runs,
-    write_runs,
-)
-from deploy.reproduce.work_folder import policy_file
+from deploy.reproduce.runs import RunPlan, read_runs, write_runs
+from deploy.reproduce.side_by_side import finish_runs
+from deploy.reproduce.work_folder import checkpoints_folder, policy_file
 from learner.steps.compute import ON_CPU, Compute
 from tests.unit.deploy.reproduce.short_experiments import (
     INITIALISED,

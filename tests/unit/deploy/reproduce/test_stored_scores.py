@@ -14,7 +14,8 @@ from deploy.reproduce import catalogue, command, stored_scores
 from deploy.reproduce.chapter4 import BID, CLONING
 from deploy.reproduce.command import CURVES, PAGE, SCORES
 from deploy.reproduce.experiment import Experiment, Panel, with_changes
-from deploy.reproduce.runs import finish_runs, read_runs
+from deploy.reproduce.runs import read_runs
+from deploy.reproduce.side_by_side import finish_runs
 from deploy.reproduce.stored_scores import (
     StoredScore,
     read_scores,
