@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from actors.envs.planar_arm import INCREMENTS_RAD, end_effector_m, reaching_reward
 
 BEAM_WIDTH: Final = 1000
+_MOST_WAYS: Final = 25
+"""To a pose, for which room is left among those that are looked at."""
 _CHANCE_EPISODES: Final = 2000
 
 
@@ -30,6 +32,7 @@ def best_reaching_return(n_joints: int, horizon: int, width: int = BEAM_WIDTH) -
         rewards = reaching_reward(end_effector_m(after_rad))
         after_returns = returns.repeat(len(moves_rad)) + rewards
         order = np.argsort(-(after_returns + steps_left * rewards), kind="stable")
+        order = order[: _MOST_WAYS * width]
         # Of the ways to one pose the best, which comes first.
         _, first = np.unique(after_rad[order].round(6), axis=0, return_index=True)
         kept = order[np.sort(first)[:width]]
