@@ -23,7 +23,8 @@ def test_every_experiment_of_the_catalogue_can_be_planned() -> None:
         for plan in plans:
             assert isinstance(plan.preset, Preset)
             has_demonstrations = plan.preset.initialisation or plan.preset.imitation
-            assert (plan.key.mistake_rate is not None) == (has_demonstrations is not None)
+            has_demonstrator = plan.key.mistake_rate is not None or plan.demonstrator is not None
+            assert has_demonstrator == (has_demonstrations is not None)
 
 
 def test_some_conditions_alone() -> None:
