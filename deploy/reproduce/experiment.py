@@ -138,10 +138,13 @@ class Experiment:
         """
         if panel.demonstrator is None:
             return None
-        made = (*self.overrides, *panel.overrides, *panel.demonstrator.overrides)
-        length = f"schedule.iterations={panel.demonstrator.updates}"
-        overrides = (*made, *self.changes, length, f"seed={seed}")
-        learned = load_preset(self.preset_name(panel), overrides)
+        made = (*self.overrides, *panel.overrides, *self.changes)
+        # Last: whatever is changed for those that imitate, it learns as the panel says.
+        its_own = (
+            *panel.demonstrator.overrides,
+            f"schedule.iterations={panel.demonstrator.updates}",
+        )
+        learned = load_preset(self.preset_name(panel), (*made, *its_own, f"seed={seed}"))
         preset = dataclasses.replace(learned, imitation=None, initialisation=None)
         key = RunKey(DEMONSTRATOR, seed, preset.digest, "untrained", None, self.episodes)
         return RunPlan(key, preset)

@@ -10,8 +10,9 @@ from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import preset_names
 from deploy.reproduce.catalogue import EXPERIMENTS, find
-from deploy.reproduce.experiment import with_changes
-from tests.unit.deploy.reproduce.short_experiments import SMOKE
+from deploy.reproduce.chapter4 import BID
+from deploy.reproduce.experiment import PolicyUnderTraining, with_changes
+from tests.unit.deploy.reproduce.short_experiments import IMITATION, SMOKE
 
 
 def test_every_experiment_of_the_catalogue_can_be_planned() -> None:
@@ -74,3 +75,24 @@ def test_each_method_has_the_same_budget_on_seeds_that_are_not_reported() -> Non
     assert [len(runs) for runs in tried] == [16] * 4
     reported = {seed for panel in EXPERIMENTS["figure-3.5"].panels for seed in panel.seed_numbers}
     assert not reported & {seed for panel in tuning.panels for seed in panel.seed_numbers}
+
+
+def test_who_demonstrates_learns_as_its_panel_says_whatever_is_changed_for_the_others() -> None:
+    learning = ("algorithm.method=dpn", "algorithm.sigma=0.0", "schedule.target_switches=2")
+    teacher = PolicyUnderTraining(1, (*learning, "imitation.generator_epochs=2"))
+    panel = replace(IMITATION.panels[0], demonstrator=teacher)
+    experiment = replace(IMITATION, panels=(panel,))
+    changes = ["schedule.target_switches=3", "imitation.generator_epochs=3", "algorithm.eta=2.0"]
+    changed = with_changes(experiment, overrides=changes)
+    plan, as_it_was = (it.plan(it.panels[0], BID, 0) for it in (changed, experiment))
+    assert plan.preset.schedule.target_switches == 3
+    learned, before = plan.demonstrator, as_it_was.demonstrator
+    assert learned is not None
+    assert before is not None
+    assert learned.preset.schedule == before.preset.schedule
+    assert learned.preset.schedule.iterations == 1
+    assert (learned.preset.algorithm.eta, before.preset.algorithm.eta) == (2.0, 1.0)
+    assert learned.preset.task == plan.preset.task
+    assert {learned.preset.imitation, learned.preset.initialisation} == {None}
+    assert plan.key.mistake_rate is None
+    assert plan.key.demonstrator == learned.key.name != before.key.name
