@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -15,6 +16,7 @@ _MOST_WAYS: Final = 25
 _CHANCE_EPISODES: Final = 2000
 
 
+@cache
 def best_reaching_return(n_joints: int, horizon: int, width: int = BEAM_WIDTH) -> float:
     """The highest return that beam search finds, without discount.
 
@@ -40,6 +42,7 @@ def best_reaching_return(n_joints: int, horizon: int, width: int = BEAM_WIDTH) -
     return float(returns.max())
 
 
+@cache
 def chance_reaching_return(n_joints: int, horizon: int) -> float:
     """The mean return of random actions, without discount, over 2000 episodes."""
     random = np.random.default_rng(0)

@@ -163,10 +163,10 @@ _LEARNING: Final = (
     "schedule.epochs=1",
     "imitation.generator_epochs=4",
 )
-"""A learner that makes a fifth of K's epochs an update, and is not near the optimum after five.
+"""A learner that makes a fifth of K's epochs an update.
 
-With all 20 it is: its episodes have a mean return of -21.8 then (seed 100). With two or three it is
-so bad on some seeds (100 to 102, 0 and 3) that no draw shows three target states.
+With all 20 its episodes have a mean return of -21.8 after five updates (seed 100), with four of
+-23.0 to -26.2 (seeds 100 to 106). With two or three some seeds' do not come near the target.
 """
 
 

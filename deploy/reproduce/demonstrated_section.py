@@ -56,7 +56,7 @@ def who_demonstrated(panels: Sequence[PanelRuns]) -> list[str]:
             "of its actions random, drawn anew for each seed and the same for all conditions of "
             "it; they begin where a run's first episodes do."
         )
-    lines += _policies_under_training(each.panel for each in panels)
+    lines += _policies_under_training(it.panel for it in panels if any(it.runs.values()))
     return lines
 
 

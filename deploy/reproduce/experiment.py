@@ -139,7 +139,7 @@ class Experiment:
         if panel.demonstrator is None:
             return None
         made = (*self.overrides, *panel.overrides, *self.changes)
-        # Last: whatever is changed for those that imitate, it learns as the panel says.
+        # Last: what the panel says of it holds. Other changes are its own, too.
         its_own = (
             *panel.demonstrator.overrides,
             f"schedule.iterations={panel.demonstrator.updates}",

@@ -53,12 +53,13 @@ class PanelRuns:
 
     def demonstrated_returns(self) -> dict[int, float]:
         """Mean return of what was demonstrated to the runs, by seed."""
-        return {
+        returns = {
             run.key.seed: demonstrated
             for condition in self.panel.conditions
             for run in self.runs[condition.name]
             if (demonstrated := run.demonstrated_return) is not None
         }
+        return dict(sorted(returns.items()))
 
     def above_demonstrations(self, condition: Condition) -> PairedDifference | None:
         """The last policy's return minus the mean return of what was demonstrated to it."""

@@ -6,9 +6,10 @@ import multiprocessing
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from pathlib import Path
 
 from broker_config.errors import StorageError
@@ -58,7 +59,8 @@ def finish_runs(
         All runs asked for, in the order of `plans`.
 
     Raises:
-        ClothbusError: A run has failed; all others were finished before.
+        ClothbusError: A run has failed; all others were finished before, but for those that it
+            would have demonstrated to.
         StorageError: The file cannot be read or written, or the process of a run was killed; what
             was under way goes on next time.
     """
@@ -74,26 +76,50 @@ def finish_runs(
             missing.append(plan)
         elif kept.compute not in (str(plan.compute(compute)), ON_CLONING):
             sys.stderr.write(f"{plan.key.name}: kept as it is, by {kept.compute}\n")
-    demonstrators = _missing_demonstrators(missing, work)
+    errors: list[BaseException] = []
+    demonstrators = list(_missing_demonstrators(missing, work, compute, finished, errors))
     followed |= {plan.key: iterations_of(plan, None) for plan in demonstrators}
     for wave in (demonstrators, missing):
-        whole = {plan.key: iterations_of(plan, None) for plan in wave}
-        errors: list[BaseException] = []
-        for run in _run_side_by_side(wave, work, compute, jobs, followed, errors):
+        able = [it for it in wave if it.demonstrator is None or _has_policy(it.demonstrator, work)]
+        whole = {plan.key: iterations_of(plan, None) for plan in able}
+        for run in _run_side_by_side(able, work, compute, jobs, followed, errors):
             finished[run.key] = run
             write_runs(curves, finished.values())
             # Only now: whatever ends this process before, the run goes on from its last iteration.
             if run.iterations >= whole[run.key]:
                 shutil.rmtree(checkpoints_folder(work, run.key), ignore_errors=True)
-        if errors:
-            raise errors[0]
+    if errors:
+        raise errors[0]
     return [up_to(finished[plan.key], wanted[plan.key]) for plan in plans]
 
 
-def _missing_demonstrators(plans: Iterable[RunPlan], work: Path) -> list[RunPlan]:
-    """The runs, each once, that are to demonstrate to these and have left no policy here."""
-    wanted = {it.demonstrator.key: it.demonstrator for it in plans if it.demonstrator is not None}
-    return [plan for plan in wanted.values() if not policy_file(work, plan).exists()]
+def _missing_demonstrators(
+    plans: Iterable[RunPlan],
+    work: Path,
+    compute: Compute,
+    finished: Mapping[RunKey, FinishedRun],
+    errors: list[BaseException],
+) -> Iterator[RunPlan]:
+    """The runs, each once, that are to demonstrate to these and have left no policy here.
+
+    What has learned elsewhere learns again by the same path: by another it would be another
+    demonstrator, and conditions of one seed would not have the same one.
+    """
+    for plan in {it.demonstrator.key: it.demonstrator for it in plans if it.demonstrator}.values():
+        # With a checkpoint its curve may not be in the file yet.
+        if _has_policy(plan, work) and not checkpoints_folder(work, plan.key).exists():
+            continue
+        try:
+            begun = finished.get(plan.key)
+            by = compute if begun is None else compute.as_begun(begun.compute)
+        except StorageError as error:
+            errors.append(StorageError(f"{plan.key.name}: {error}"))
+        else:
+            yield replace(plan, path=by.path)
+
+
+def _has_policy(plan: RunPlan, work: Path) -> bool:
+    return policy_file(work, plan).exists()
 
 
 def _run_side_by_side(

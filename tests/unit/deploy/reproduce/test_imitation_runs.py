@@ -30,7 +30,7 @@ from deploy.reproduce.page import write_page
 from deploy.reproduce.panel_runs import sort_runs
 from deploy.reproduce.runs import read_runs
 from deploy.reproduce.side_by_side import finish_runs
-from deploy.reproduce.work_folder import policy_file
+from deploy.reproduce.work_folder import checkpoints_folder, policy_file
 from discriminator.real_states import real_states
 from learner.cloning import clone, cloning_preset
 from learner.steps.compute import Compute
@@ -242,3 +242,25 @@ def test_a_demonstrator_whose_policy_is_not_here_learns_again(tmp_path: Path) ->
         made.append(policy_file(work, plan.demonstrator).read_bytes())
     assert made[0] == made[1]
     assert len(read_runs(curves)) == 2
+
+    # By another path it would be another demonstrator; who needs it not is made all the same.
+    by_script = IMITATION.plan(IMITATION.panels[0], CLONING, 0)
+    reference = Compute(path="reference")
+    with pytest.raises(StorageError, match=rf"{plan.demonstrator.key.name}: expected to go on by"):
+        finish_runs([plan, by_script], curves, tmp_path, reference, 1, None, anew={plan.key})
+    assert by_script.key in {run.key for run in read_runs(curves)}
+    assert not policy_file(tmp_path, plan).exists()
+
+
+def test_a_demonstrator_whose_curve_was_not_written_before_a_kill_is_told_of(
+    tmp_path: Path,
+) -> None:
+    plan = TAUGHT.plan(TAUGHT.panels[0], CLONING, 0)
+    assert plan.demonstrator is not None
+    with InProcessRun(plan.demonstrator, tmp_path) as learned:
+        list(learned.finish())
+        learned.keep_policy()
+    finish_runs([plan], tmp_path / "curves.jsonl", tmp_path, Compute(), 1, None)
+    runs = {run.key: run for run in read_runs(tmp_path / "curves.jsonl")}
+    assert list(runs[plan.demonstrator.key].points) == learned.points
+    assert not checkpoints_folder(tmp_path, plan.demonstrator.key).exists()
