@@ -82,7 +82,8 @@ def _demonstrator(plan: RunPlan, neutral: Preset, work: Path) -> tuple[str, Acti
         return f"scripted-{rate:g}", by_script(neutral, rate)
     learned, name = plan.demonstrator, plan.demonstrator.key.name
     policy = kept_policy(work, learned)
-    version, digest = learned.preset.schedule.iterations, policy_digest(policy_file(work, learned))
+    version = learned.preset.schedule.iteration_versions()[-1]
+    digest = policy_digest(policy_file(work, learned))
     assert digest is not None  # it has just been read
     played = SnapshotPlayed(name, version, digest, acting_epsilon(learned.preset, version))
     return name, by_snapshot(learned.preset, policy, played)
