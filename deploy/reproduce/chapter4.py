@@ -329,6 +329,9 @@ TRANSFER_OF_CHAPTER_4: Final = (
         source="beside tables 4.3 and 4.5",
         published="nothing: the source trains and tests on the same cloth.",
         policies=(
+            KeptPolicies(
+                "figure-4.9", "60 actions, 8 iterations", ("pgail-bid", "pgail", "cloning")
+            ),
             KeptPolicies("figure-4.9", "60 actions", ("pgail-bid", "pgail", "cloning")),
             KeptPolicies("table-4.5", "shirt", ("pgail-bid", "cloning")),
             KeptPolicies("table-4.5", "trousers", ("pgail-bid", "cloning")),
