@@ -174,7 +174,7 @@ def _learned_from(updates: int) -> Panel:
     """Imitation of a policy that is under training, as figure 4.5 has it."""
     return Panel(
         f"demonstrated after {updates} updates",
-        _FOUR_IMITATORS,
+        (*_FOUR_IMITATORS, CLONING, CLONING_AUGMENTED),
         seeds=5,
         overrides=("imitation.target_reward=-0.35",),
         demonstrator=PolicyUnderTraining(updates, _LEARNING),
@@ -207,6 +207,7 @@ CHAPTER_4: Final = (
                 seeds=5,
                 mistake_rate=0.2,
             ),
+            Panel("no mistakes", (BID, CLONING, CLONING_AUGMENTED), seeds=5, mistake_rate=0.0),
         ),
         notes=(
             *_IMITATION_NOTES,
