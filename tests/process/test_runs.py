@@ -15,6 +15,7 @@ from tests.process.conftest import (
     Start,
     heartbeat_pid,
     the_run,
+    trajectories,
     undisturbed_weights,
     wait_for_trajectories,
     weights,
@@ -91,8 +92,9 @@ def test_ctrl_c_ends_everything_and_the_run_can_be_resumed(start: Start, tmp_pat
     for name in ("preset.json", "journal.sqlite", "learning_curve.png", "film_strip.png"):
         assert (folder / name).stat().st_size > 0
     before = len(list((folder / "snapshots").iterdir()))
+    played = trajectories(folder)
     resumed = start("resumed", "run", "--resume", folder, "--in-process")
-    wait_for_trajectories(folder, 8)
+    wait_for_trajectories(folder, played + 5)
     resumed.process.send_signal(signal.SIGINT)
     assert resumed.wait(60) == 130, resumed.log.read_text()[-3000:]
     assert before >= 1
