@@ -133,26 +133,27 @@ def by_policy(preset: Preset, run: RunFolder, version: int | None = None) -> Act
             "this task"
         )
     kept = kept_policy(run, of_run, version)
-    played = SnapshotPlayed(
-        run.run, kept.version, kept.digest, acting_epsilon(of_run, kept.version)
-    )
-    return by_snapshot(of_run, kept.policy, played)
+    return by_version(run.run, of_run, kept.version, kept.digest, kept.policy)
 
 
-def by_snapshot(of_run: Preset, policy: Policy, played: SnapshotPlayed) -> ActingDemonstrator:
+def by_version(
+    run: str, of_run: Preset, version: int, digest: str, policy: Policy
+) -> ActingDemonstrator:
     """A policy acting as it does in the run that it is of.
 
     Args:
-        of_run: The run's preset.
+        run: The run's name.
+        of_run: Its preset.
+        version: Of the policy.
+        digest: SHA-256 of its weights.
         policy: Which acts.
-        played: What is said of it.
     """
     acting = collecting_policy(of_run.algorithm, policy)
+    played = SnapshotPlayed(run, version, digest, _epsilon(of_run, version))
     return ActingDemonstrator(Demonstrator("policy", snapshot=played), lambda _: acting)
 
 
-def acting_epsilon(preset: Preset, version: int) -> float:
-    """Probability of a random action in a version's first episode; 0 for the DPN family."""
+def _epsilon(preset: Preset, version: int) -> float:
     if preset.exploration is None or not preset.algorithm.is_epsilon_greedy:
         return 0.0
     updates = version + preset.schedule.policy_lag if version else 0

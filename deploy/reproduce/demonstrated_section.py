@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from actors.demonstrate.reaching_range import best_reaching_return, chance_reaching_return
+from actors.envs.planar_arm import INCREMENTS_RAD
 from broker_config.preset import TaskPreset
 from deploy.reproduce.experiment import Panel
 from deploy.reproduce.panel_runs import PanelRuns
@@ -29,7 +30,7 @@ def demonstrated_returns(panel_runs: PanelRuns, task: TaskPreset) -> str:
     said = f"Demonstrations: mean return {mean:.2f} (seed by seed {by_seed})"
     if task.environment != _REACHING:
         return f"{said}."
-    n_joints = _n_joints(task.options)
+    n_joints = task.n_actions // len(INCREMENTS_RAD)
     chance = chance_reaching_return(n_joints, task.horizon)
     best = best_reaching_return(n_joints, task.horizon)
     quality = (mean - chance) / (best - chance)
@@ -37,12 +38,6 @@ def demonstrated_returns(panel_runs: PanelRuns, task: TaskPreset) -> str:
         f"{said}: quality {quality:.2f}, where 0 is chance ({chance:.1f}) and 1 the best that beam "
         f"search finds ({best:.1f})."
     )
-
-
-def _n_joints(options: Mapping[str, object]) -> int:
-    given = options.get("n_joints", 5)
-    assert isinstance(given, int)  # presets are checked where they are read
-    return given
 
 
 def who_demonstrated(panels: Sequence[PanelRuns]) -> list[str]:

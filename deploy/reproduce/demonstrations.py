@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from broker_config.errors import StorageError
-from broker_config.messages import SnapshotPlayed, Trajectory
+from broker_config.messages import Trajectory
 from broker_config.preset import ImitationPreset, Preset
 from deploy.demonstrations.demonstrators import (
     ActingDemonstrator,
-    acting_epsilon,
     by_script,
-    by_snapshot,
+    by_version,
 )
 from deploy.demonstrations.making import (
     LEAST_TARGETS,
@@ -85,8 +84,7 @@ def _demonstrator(plan: RunPlan, neutral: Preset, work: Path) -> tuple[str, Acti
     version = learned.preset.schedule.iteration_versions()[-1]
     digest = policy_digest(policy_file(work, learned))
     assert digest is not None  # it has just been read
-    played = SnapshotPlayed(name, version, digest, acting_epsilon(learned.preset, version))
-    return name, by_snapshot(learned.preset, policy, played)
+    return name, by_version(name, learned.preset, version, digest, policy)
 
 
 def _has_targets(demonstrations: list[Trajectory], imitation: ImitationPreset) -> bool:

@@ -39,7 +39,7 @@ class PolicyUnderTraining:
     """A demonstrator that has learned for a while, from the task's own rewards."""
 
     updates: int
-    """After which it demonstrates."""
+    """Iterations, which end with an update, after which it demonstrates."""
     overrides: tuple[str, ...]
     """Settings by which it learns, beside those of the panel."""
 
