@@ -10,6 +10,7 @@ WEIGHTS_STREAM: Final = 0
 SHUFFLING_STREAM: Final = 1
 EXPERT_DISCRIMINATOR_STREAM: Final = 2
 TARGET_DISCRIMINATOR_STREAM: Final = 3
+AUGMENTATION_STREAM: Final = 4
 
 
 def stream_seed(seed: int, stream: int) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from broker_config.errors import MessageError, StorageError
+
+_CHANGED_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,9 @@ class LocalMemory:
     The pictures lie in a ring that is allocated once. It has room for 2 * capacity of them, which
     is what is needed when every trajectory has a single sample; its address never changes. Pictures
     that stay lie at its beginning, and the others go round behind them.
+
+    Attributes:
+        learned_from: The ring as gradient steps see it: itself, or what `change_pictures` has made.
     """
 
     def __init__(
@@ -69,6 +74,7 @@ class LocalMemory:
         self.capacity = capacity
         self.device = torch.device(device)
         self.ring = torch.zeros((2 * capacity, *observation_shape), dtype=torch.uint8).to(device)
+        self.learned_from = self.ring
         self._first = 0  # where the oldest picture is, among the places that are gone round in
         self._n_frames = 0
         self._n_held = 0
@@ -181,6 +187,17 @@ class LocalMemory:
     def states_after(self) -> Tensor:
         """The picture after each sample, u8[n, H, W, C], oldest first."""
         return self.ring[self._places(self._samples.positions + 1)]
+
+    def change_pictures(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Has gradient steps see every sample's picture changed, until it is called again.
+
+        Args:
+            change: Takes and gives u8[B, H, W, C].
+        """
+        if self.learned_from is self.ring:
+            self.learned_from = torch.zeros_like(self.ring)
+        for places in torch.split(self.ring_positions, _CHANGED_AT_ONCE):
+            self.learned_from[places] = change(self.ring[places])
 
     def replace_rewards(self, rewards: Tensor) -> None:
         """Gives every sample a new reward, oldest first: Algorithm 4 labels anew.

@@ -22,8 +22,14 @@ from torch import Tensor
 from actors.networks import PreferenceNetwork, build_network, weights_to_bytes
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import Preset
-from broker_config.seeds import SHUFFLING_STREAM, WEIGHTS_STREAM, stream_seed
+from broker_config.seeds import (
+    AUGMENTATION_STREAM,
+    SHUFFLING_STREAM,
+    WEIGHTS_STREAM,
+    stream_seed,
+)
 from learner.assessment import Assessment, assess, double_q_signals
+from learner.augmentation import augmented
 from learner.memory import LocalMemory
 from learner.minibatches import balanced, shuffled
 from learner.steps.compute import EVALUATED_AT_ONCE, ON_CPU, Compute, TrainingPath
@@ -107,7 +113,10 @@ class Trainer:
         ).to(compute.device)
         self._optimiser = build_optimiser(preset.optimiser, self._network)
         self._memory = LocalMemory(_capacity(preset), preset.task.observation_shape, compute.device)
-        self._shuffling = torch.Generator().manual_seed(stream_seed(preset.seed, SHUFFLING_STREAM))
+        self._shuffling, self._augmenting = (
+            torch.Generator().manual_seed(stream_seed(preset.seed, stream))
+            for stream in (SHUFFLING_STREAM, AUGMENTATION_STREAM)
+        )
         self._counters = _Counters()
         self._steps, self._evaluate = _make_steps(
             compute.chosen_path, self._network, self._optimiser, self._memory
@@ -216,7 +225,8 @@ class Trainer:
         tensors = {f"memory.{name}": part for name, part in self._memory.get_state().items()}
         for name, tensor in self._trained_tensors().items():
             tensors[name] = tensor.detach().to("cpu", copy=True).contiguous()
-        tensors["shuffling"] = self._shuffling.get_state()
+        for name, generator in self._generators().items():
+            tensors[name] = generator.get_state()
         return TrainerState(tensors, asdict(self._counters))
 
     def set_state(self, state: TrainerState) -> None:
@@ -231,18 +241,26 @@ class Trainer:
             for name in list(tensors)
             if name.startswith("memory.")
         }
-        shuffling = tensors.pop("shuffling", None)
-        if shuffling is None or state.counters.keys() != asdict(self._counters).keys():
+        generators = self._generators()
+        drawn = {name: tensors.pop(name) for name in generators if name in tensors}
+        counters = asdict(self._counters)
+        if drawn.keys() != generators.keys() or state.counters.keys() != counters.keys():
             raise StorageError(
-                "trainer state: expected a shuffling state and the counters "
-                f"{', '.join(asdict(self._counters))}; got {', '.join(state.counters)}; the "
-                "checkpoint is of another version"
+                f"trainer state: expected {', '.join([*generators, *counters])}; got "
+                f"{', '.join([*drawn, *state.counters])}; the checkpoint is of another version"
             )
         self._memory.check_valid(memory)
         overwrite(self._trained_tensors(), tensors, "trainer state")
         self._memory.set_state(memory)
-        self._shuffling.set_state(shuffling)
+        for name, generator in generators.items():
+            generator.set_state(drawn[name])
         self._counters = _Counters(**state.counters)
+
+    def _generators(self) -> dict[str, torch.Generator]:
+        """By their names in a state."""
+        if self._preset.augmentation is None:
+            return {"shuffling": self._shuffling}
+        return {"shuffling": self._shuffling, "augmenting": self._augmenting}
 
     def _trained_tensors(self) -> dict[str, Tensor]:
         network = {f"network.{name}": part for name, part in self._network.named_parameters()}
@@ -269,14 +287,27 @@ class Trainer:
         return torch.cat(losses).mean()
 
     def _run_epochs(self, n_epochs: int, teaching_signals: Tensor) -> Tensor:
-        epochs = torch.cat([self._draw_epoch() for _ in range(n_epochs)])
-        self._counters.gradient_steps += len(epochs)
+        epochs = [self._draw_epoch() for _ in range(n_epochs)]
+        if self._preset.augmentation is None:
+            return self._make_steps(torch.cat(epochs), teaching_signals)
         losses = []
-        for batches in torch.split(epochs, _STEPS_AT_ONCE):
+        for epoch in epochs:
+            self._memory.change_pictures(self._augmented)
+            losses.append(self._make_steps(epoch, teaching_signals))
+        return torch.cat(losses)
+
+    def _make_steps(self, minibatches: Tensor, teaching_signals: Tensor) -> Tensor:
+        self._counters.gradient_steps += len(minibatches)
+        losses = []
+        for batches in torch.split(minibatches, _STEPS_AT_ONCE):
             with self._numerics():
                 losses.append(self._steps.run(batches, teaching_signals))
             self._on_step()
         return torch.cat(losses)
+
+    def _augmented(self, pictures: Tensor) -> Tensor:
+        assert self._preset.augmentation is not None
+        return augmented(pictures, self._preset.augmentation, self._augmenting)
 
     def _draw_epoch(self) -> Tensor:
         n_held, n_samples = self._memory.n_held, len(self._memory)

@@ -15,6 +15,7 @@ from broker_config.preset.reading import (
 )
 from broker_config.preset.tables import (
     AlgorithmPreset,
+    AugmentationPreset,
     ExplorationPreset,
     InitialisationPreset,
     OptimiserPreset,
@@ -25,6 +26,7 @@ from broker_config.preset.tables import (
 
 __all__ = [
     "AlgorithmPreset",
+    "AugmentationPreset",
     "DiscriminatorPreset",
     "ExplorationPreset",
     "ImitationPreset",

@@ -10,6 +10,7 @@ from broker_config.messages.rules import require
 from broker_config.preset.imitation import ImitationPreset
 from broker_config.preset.tables import (
     AlgorithmPreset,
+    AugmentationPreset,
     ExplorationPreset,
     InitialisationPreset,
     OptimiserPreset,
@@ -17,7 +18,7 @@ from broker_config.preset.tables import (
     TaskPreset,
 )
 from broker_config.specs import NetworkSpec
-from broker_config.structure import to_plain
+from broker_config.structure import added, to_plain
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Preset:
     exploration: ExplorationPreset | None = None
     initialisation: InitialisationPreset | None = None
     imitation: ImitationPreset | None = None
+    augmentation: AugmentationPreset | None = added(None)
 
     def __post_init__(self) -> None:
         require(0 <= self.seed < 2**32, "seed", "a number in [0, 2**32)", self.seed)

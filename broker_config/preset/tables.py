@@ -193,6 +193,25 @@ class ExplorationPreset:
 
 
 @dataclass(frozen=True)
+class AugmentationPreset:
+    """How pictures are changed, anew in each epoch, before the network learns from them.
+
+    Only for tasks whose actions mean the same wherever the picture shows things, as fold lines of a
+    garment's outline do.
+    """
+
+    turn_deg: float
+    """By up to so much, either way; 0 for not at all."""
+    shift_px: int
+    """By up to so many, either way; 0 for not at all."""
+
+    def __post_init__(self) -> None:
+        turn, shift = self.turn_deg, self.shift_px
+        require(0 <= turn <= 180, "augmentation.turn_deg", "0 to 180", turn)
+        require(shift >= 0, "augmentation.shift_px", "at least 0", shift)
+
+
+@dataclass(frozen=True)
 class InitialisationPreset:
     """Algorithm 2: the policy is initialised from demonstrations."""
 

@@ -60,7 +60,7 @@ class EagerSteps:
         positions, actions = self._memory.ring_positions, self._memory.samples.actions
         losses = torch.empty(len(batches), device=self._memory.device)
         for step, batch in enumerate(batches):
-            observations = self._memory.ring[positions[batch]]
+            observations = self._memory.learned_from[positions[batch]]
             loss = preference_loss(self._network, observations, actions[batch], targets[batch])
             self._optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]

@@ -74,7 +74,8 @@ class _Table:
 class GraphedSteps:
     """Makes the steps by replaying graphs; equals `EagerSteps` up to rounding.
 
-    The memory's ring, the network's parameters and the optimiser's state must stay where they are.
+    The pictures of the memory that steps see, the network's parameters and the optimiser's state
+    must stay where they are.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class GraphedSteps:
 
     def _step(self, table: _Table) -> None:
         batch = table.batches.index_select(0, table.cursor).squeeze(0)
-        observations = self._memory.ring.index_select(0, self._positions[batch])
+        observations = self._memory.learned_from.index_select(0, self._positions[batch])
         loss = preference_loss(
             self._network, observations, self._actions[batch], self._targets[batch]
         )

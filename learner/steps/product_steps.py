@@ -54,7 +54,7 @@ class ProductSteps:
         losses = torch.empty(len(batches))
         trunk.follow()
         for step, batch in enumerate(batches):
-            hidden = trunk.forward(self._memory.ring.index_select(0, positions[batch]))
+            hidden = trunk.forward(self._memory.learned_from.index_select(0, positions[batch]))
             self._optimiser.zero_grad()
             losses[step] = self._head_step(hidden, actions[batch], targets[batch])
             trunk.backward([units.grad for units in hidden], self._optimiser)

@@ -243,3 +243,14 @@ def test_an_empty_memory_has_a_state() -> None:
 def test_refuses_to_hold_nothing() -> None:
     with pytest.raises(MessageError, match="at least 1"):
         LocalMemory(0, SHAPE)
+
+
+def test_steps_see_changed_pictures_and_everybody_else_those_that_were_added() -> None:
+    memory = LocalMemory(6, SHAPE)
+    for seed in range(5):  # the ring has wrapped
+        memory.add(*trajectory(4, seed), terminated=False)
+    before, places = contents(memory), memory.ring_positions
+    assert torch.equal(memory.learned_from[places], memory.ring[places])
+    memory.change_pictures(lambda pictures: 255 - pictures)
+    assert torch.equal(memory.learned_from[places], 255 - memory.ring[places])
+    assert contents(memory) == before

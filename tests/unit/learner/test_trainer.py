@@ -1,4 +1,5 @@
 import dataclasses
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from broker_config.errors import MessageError, StorageError
 from broker_config.preset import (
     AlgorithmPreset,
+    AugmentationPreset,
     ExplorationPreset,
     InitialisationPreset,
     OptimiserPreset,
@@ -41,6 +43,7 @@ PRESET = Preset(
     exploration=ExplorationPreset(1.0, 0.1, 4),
     initialisation=InitialisationPreset(6, 3),
 )
+AUGMENTATION = AugmentationPreset(turn_deg=20.0, shift_px=3)
 
 
 def preset_with(**changes: object) -> Preset:
@@ -127,6 +130,11 @@ def test_the_same_calls_give_the_same_state() -> None:
 @pytest.mark.parametrize("optimiser", ["adam", "rmsprop"])
 def test_goes_on_bit_identically_from_its_saved_state(optimiser: str) -> None:
     preset = preset_with(optimiser__name=optimiser, algorithm__head="dueling-exact")
+    check_goes_on(preset)
+    check_goes_on(replace(preset, augmentation=AUGMENTATION))
+
+
+def check_goes_on(preset: Preset) -> None:
     trainer = trained(preset)
     state = trainer.get_state()
     resumed = Trainer(replace(preset, seed=99))  # whatever it drew by itself is overwritten
@@ -158,7 +166,7 @@ def test_refuses_a_state_of_another_preset() -> None:
         Trainer(preset_with(algorithm__head="dueling-exact")).set_state(state)
     with pytest.raises(StorageError, match="at most 5 samples"):
         Trainer(preset_with(schedule__memory_samples=5)).set_state(state)
-    with pytest.raises(StorageError, match="counters updates, target_switches"):
+    with pytest.raises(StorageError, match="expected shuffling, updates, target_switches"):
         Trainer(PRESET).set_state(TrainerState(state.tensors, {"updates": 1}))
 
 
@@ -286,6 +294,11 @@ def test_refuses_what_it_cannot_do() -> None:
 def test_the_program_of_the_cuda_graph_makes_the_same_steps(optimiser: str) -> None:
     """The program that a GPU records, run as it is on the CPU: bit for bit the eager steps."""
     preset = preset_with(optimiser__name=optimiser, schedule__epochs=10)
+    check_graphs(preset)
+    check_graphs(replace(preset, augmentation=AUGMENTATION))
+
+
+def check_graphs(preset: Preset) -> None:
     eager, graphed = (Trainer(preset, Compute(path="reference")) for _ in range(2))
     assert isinstance(eager._steps, EagerSteps)
     graphed._steps = GraphedSteps(
@@ -308,6 +321,38 @@ def run_twice_then_repeat(program):
     program()
     program()
     return program
+
+
+def test_what_is_taught_is_computed_on_pictures_as_they_are() -> None:
+    plain = Trainer(PRESET)
+    changing = Trainer(replace(PRESET, augmentation=AUGMENTATION))
+    for trainer in (plain, changing):
+        add_trajectory(trainer, 0)
+        trainer._memory.change_pictures(torch.zeros_like)
+    assert torch.equal(plain._assess().teaching_signals, changing._assess().teaching_signals)
+
+
+def test_every_epoch_is_learned_from_other_pictures() -> None:
+    trainer = Trainer(replace(PRESET, augmentation=AUGMENTATION))
+    seen = []
+    run = trainer._steps.run
+
+    def watched(batches: torch.Tensor, targets: torch.Tensor) -> torch.Tensor:
+        seen.append(trainer.memory.learned_from.clone())
+        return run(batches, targets)
+
+    trainer._steps.run = watched  # type: ignore[method-assign]
+    add_trajectory(trainer, 0)
+    trainer.update(target_switches=2)
+    assert len(seen) == 2 * PRESET.schedule.epochs
+    for first, second in itertools.pairwise([trainer.memory.ring, *seen]):
+        assert not torch.equal(first, second)
+
+
+def test_a_state_of_pictures_that_were_not_changed_is_refused() -> None:
+    changing = Trainer(replace(PRESET, augmentation=AUGMENTATION))
+    with pytest.raises(StorageError, match=r"expected shuffling, augmenting, .* got shuffling, "):
+        changing.set_state(trained(PRESET, 1).get_state())
 
 
 def test_reports_are_plain_numbers() -> None:
