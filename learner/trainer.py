@@ -139,14 +139,19 @@ class Trainer:
         rewards: NDArray[np.float32],
         terminated: bool,
     ) -> None:
-        """Adds a trajectory to the memory; see `LocalMemory.add`."""
+        """Adds a trajectory to the memory; see `LocalMemory.add`.
+
+        One of the horizon's length has terminated, too, where the preset ends there.
+        """
         out_of_range = (actions < 0) | (actions >= self._preset.task.n_actions)
         if out_of_range.any():
             raise MessageError(
                 f"trajectory.actions: expected 0 to {self._preset.task.n_actions - 1}; got "
                 f"{actions[out_of_range][0]}; actor and learner run different presets"
             )
-        self._memory.add(observations, actions, rewards, terminated)
+        is_whole = len(actions) == self._preset.task.horizon
+        ended = terminated or (is_whole and self._preset.algorithm.ends_at_horizon)
+        self._memory.add(observations, actions, rewards, ended)
 
     def initialise(self) -> UpdateReport:
         """Trains on the demonstrations that were added, for K target switches.

@@ -9,6 +9,7 @@ from typing import Literal
 
 from broker_config.messages.rules import require
 from broker_config.specs import Head
+from broker_config.structure import added
 
 TaskOption = bool | int | float | str
 
@@ -45,6 +46,10 @@ class AlgorithmPreset:
     """Weight of the causal entropy (eq. 4.4); 0 except for EDPN and Munchausen DQN."""
     gamma: float
     """Discount factor of one step, in [0, 1)."""
+    ends_at_horizon: bool = added(False)
+    """Whether nothing counts after the horizon. Else it only interrupts: the value of an episode's
+    last state goes into the teaching signal. That value is never taught where no episode goes on
+    from such states, as from folded clothes."""
 
     def __post_init__(self) -> None:
         finite_eta = math.isfinite(self.eta) and self.eta > 0

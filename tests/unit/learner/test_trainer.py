@@ -332,6 +332,17 @@ def test_what_is_taught_is_computed_on_pictures_as_they_are() -> None:
     assert torch.equal(plain._assess().teaching_signals, changing._assess().teaching_signals)
 
 
+def test_what_comes_after_the_horizon_counts_unless_the_preset_ends_there() -> None:
+    for ends, length, counts in ((False, 6, True), (True, 6, False), (True, 5, True)):
+        trainer = Trainer(preset_with(algorithm__ends_at_horizon=ends))
+        add_trajectory(trainer, 0, length)
+        assessment = trainer._assess()
+        samples = trainer.memory.samples
+        after = assessment.bellman_targets - samples.rewards
+        assert (after[-1] != 0) == counts
+        assert (after[:-1] != 0).all()
+
+
 def test_every_epoch_is_learned_from_other_pictures() -> None:
     trainer = Trainer(replace(PRESET, augmentation=AUGMENTATION))
     seen = []
