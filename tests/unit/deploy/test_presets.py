@@ -1,11 +1,14 @@
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import deploy
 from broker_config.preset import Preset, preset_from_json, preset_from_toml
+from deploy.reproduce.catalogue import find_experiment
+from deploy.reproduce.chapter4 import BID
 
 FOLDER = Path(deploy.__file__).parent / "presets"
 PATHS = sorted(FOLDER.glob("*.toml"))
@@ -122,6 +125,24 @@ def test_imitation_of_chapter_4_is_the_source_s(name: str) -> None:
     assert numbers == IMITATIONS[name]
     # The schedule says the same of the generator: K epochs, with a switch after each.
     assert (schedule.target_switches, schedule.epochs) == (imitation.generator_epochs, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "experiment", "panel"),
+    [
+        ("shirt-ch4-tuned", "table-4.5", "shirt"),
+        ("trousers-ch4-tuned", "table-4.5", "trousers"),
+        ("handkerchief-ch4-tuned", "figure-4.9", "60 actions, 8 iterations"),
+    ],
+)
+def test_tuned_presets_are_what_the_reproduction_shows(
+    name: str, experiment: str, panel: str
+) -> None:
+    shown = find_experiment(experiment)
+    (found,) = (each for each in shown.panels if each.title == panel)
+    planned = shown.plan(found, BID, found.first_seed).preset
+    preset = load(name)
+    assert preset == replace(planned, name=preset.name, source=preset.source, seed=preset.seed)
 
 
 @pytest.mark.parametrize("head", ["plain", "dueling-mean"])
