@@ -21,6 +21,13 @@ from tests.process.test_failpoints import arm, fired
 RUN_SECS = 300.0
 ITERATIONS = 4
 
+EVERY_WAY = (
+    "algorithm.ends_at_horizon=true",
+    "augmentation.turn_deg=10.0",
+    "augmentation.shift_px=2",
+)
+"""Of learning from what is collected: their random numbers survive a kill, too."""
+
 POINTS = (
     Failpoint.ANNOUNCEMENT_FOLLOWED,
     Failpoint.REWARDS_MADE,
@@ -51,11 +58,11 @@ def rewards_in(folder: Path) -> list[Rewards]:
 def test_weights_and_rewards_are_the_same_in_one_process_over_the_bus_and_after_kills(
     start: Start, tmp_path: Path, demonstrations: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    named = ["run", "imitation-smoke", "--demonstrations", demonstrations, "--runs"]
-    alone = start("alone", *named, tmp_path / "alone", "--in-process")
-    bus = start("bus", *named, tmp_path / "bus", "--actors", 3, "--no-record")
+    named = ["run", "imitation-smoke", "--demonstrations", demonstrations, "--set", *EVERY_WAY]
+    alone = start("alone", *named, "--runs", tmp_path / "alone", "--in-process")
+    bus = start("bus", *named, "--runs", tmp_path / "bus", "--actors", 3, "--no-record")
     arm(monkeypatch, tmp_path / "flags", POINTS, count=1)
-    killed = start("killed", *named, tmp_path / "killed", "--actors", 1)
+    killed = start("killed", *named, "--runs", tmp_path / "killed", "--actors", 1)
 
     folders = []
     for name, run in {"alone": alone, "bus": bus, "killed": killed}.items():
