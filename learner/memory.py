@@ -14,6 +14,7 @@ from torch import Tensor
 from broker_config.errors import MessageError, StorageError
 
 _CHANGED_AT_ONCE = 64
+"""Pictures; what a change draws for each depends on it."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ beta = eta / (1 + sigma * eta), alpha = 1 / (1 + sigma * eta), gamma discount. A
 gradients flow through every function.
 
 An episode that runs into its horizon is truncated, not terminated: the value of its last state goes
-into the teaching signal. Only `terminated` cuts it off.
+into the teaching signal. Only `terminated` cuts it off, which a preset may let the horizon do.
 """
 
 from __future__ import annotations

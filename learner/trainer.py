@@ -141,7 +141,7 @@ class Trainer:
     ) -> None:
         """Adds a trajectory to the memory; see `LocalMemory.add`.
 
-        One of the horizon's length has terminated, too, where the preset ends there.
+        One that has reached the horizon has terminated, too, where the preset ends there.
         """
         out_of_range = (actions < 0) | (actions >= self._preset.task.n_actions)
         if out_of_range.any():
@@ -149,7 +149,7 @@ class Trainer:
                 f"trajectory.actions: expected 0 to {self._preset.task.n_actions - 1}; got "
                 f"{actions[out_of_range][0]}; actor and learner run different presets"
             )
-        is_whole = len(actions) == self._preset.task.horizon
+        is_whole = len(actions) >= self._preset.task.horizon
         ended = terminated or (is_whole and self._preset.algorithm.ends_at_horizon)
         self._memory.add(observations, actions, rewards, ended)
 

@@ -7,7 +7,7 @@ class EpisodeClock:
     """Says when an episode is cut off, and refuses a step outside of an episode.
 
     The tasks here have no end of their own: an episode is truncated at the horizon, never
-    terminated, and a learner looks beyond its last step.
+    terminated, and a learner looks beyond its last step unless its preset says otherwise.
     """
 
     def __init__(self, horizon: int) -> None:

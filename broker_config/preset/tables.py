@@ -21,7 +21,7 @@ class TaskPreset:
     environment: str
     """gymnasium id, for example `clothbus/Reaching-v0`."""
     horizon: int
-    """T: steps of one episode; its end is a truncation, never a termination."""
+    """T: steps of one episode; its end is a truncation, unless the algorithm says otherwise."""
     observation_shape: tuple[int, int, int]
     n_actions: int
     options: Mapping[str, TaskOption] = field(default_factory=dict)
@@ -49,7 +49,8 @@ class AlgorithmPreset:
     ends_at_horizon: bool = added(False)
     """Whether nothing counts after the horizon. Else it only interrupts: the value of an episode's
     last state goes into the teaching signal. That value is never taught where no episode goes on
-    from such states, as from folded clothes."""
+    from such states, as from folded clothes. Pictures carry no time: where the same ones come early
+    and at the horizon, they are taught two values."""
 
     def __post_init__(self) -> None:
         finite_eta = math.isfinite(self.eta) and self.eta > 0
@@ -201,8 +202,8 @@ class ExplorationPreset:
 class AugmentationPreset:
     """How pictures are changed, anew in each epoch, before the network learns from them.
 
-    Only for tasks whose actions mean the same wherever the picture shows things, as fold lines of a
-    garment's outline do.
+    For tasks whose actions mean the same wherever the picture shows things, as fold lines of a
+    garment's outline do within limits: see `actors.cloth.fold_lines.MOST_TURN_DEG`.
     """
 
     turn_deg: float

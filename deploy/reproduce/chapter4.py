@@ -57,6 +57,8 @@ _FOLDING_NOTES = (
     "goes on, is never taught), and the generator's pictures are turned, too, and shifted, anew in "
     "each epoch. In those after the fourth the two discriminators' rewards are brought to equal "
     "spread. docs/imitation.md has what led there, on seeds that are not reported.",
+    "Cloning that is augmented learns from pictures as discriminators see them, turned by up to 30 "
+    "degrees and shifted by up to 4 px, and of colours that differ by up to 10 %.",
 )
 _FOLDING_SETTINGS = (
     *ADAM,
@@ -73,8 +75,8 @@ _FLIPPING_NOTES = (
     "expert that looks ahead, with mistakes; at least three of the five have succeeded, and their "
     "last states are the targets.",
     "Adam instead of RMSProp; one target switch after K's 10 epochs. In the first panel what was "
-    "chosen for table 4.5: pictures are turned by up to 30 degrees for the discriminators, real "
-    "and generated alike, the discriminators have spectral norm, and the generator minibatches of "
+    "chosen for the third and fourth panel of table 4.5: pictures are turned by up to 30 degrees "
+    "for the discriminators, real and generated alike, the discriminators have spectral norm, and the generator minibatches of "
     "16. In the second the same ends after 8 iterations, 2,400 samples instead of 4,200: policies "
     "that flip every time by then do so less often later on. That was seen in the first panel, "
     "hence the other seeds. In the third the two discriminators' rewards are brought to equal "
@@ -268,7 +270,9 @@ CHAPTER_4: Final = (
         overrides=_FOLDING_SETTINGS,
         panels=(
             *_folding_panels("", _ENDING),
-            *_folding_panels(", values beyond the horizon, the generator's pictures left", _STEADY),
+            *_folding_panels(
+                ", values beyond the horizon, the generator's pictures as they are", _STEADY
+            ),
             *_folding_panels(", pictures turned, no spectral norm, minibatches of 64", _TURNED),
             *_folding_panels(", pictures not turned, minibatches of 64"),
             *_folding_panels(", pictures not turned, shifted by 10 px", _SHIFTED),

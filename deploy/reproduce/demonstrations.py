@@ -58,11 +58,14 @@ def demonstrations_of(plan: RunPlan, work: Path) -> list[Trajectory]:
 def _played(plan: RunPlan, work: Path, samples: int, draw: int) -> Demonstrations:
     """At least so many samples of the demonstrator; each draw has seeds of its own."""
     # Whatever learns from them has nothing to do with how they are made.
+    drawn = preset_of_draw(cloning_preset(plan.preset), draw)
     neutral = replace(
-        preset_of_draw(cloning_preset(plan.preset), draw),
+        drawn,
+        algorithm=replace(drawn.algorithm, ends_at_horizon=False),
         exploration=None,
         initialisation=None,
         imitation=None,
+        augmentation=None,
     )
     name, demonstrator = _demonstrator(plan, neutral, work)
     folder = work / "demonstrations" / f"{neutral.digest[:12]}-{name}"

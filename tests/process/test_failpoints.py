@@ -5,7 +5,7 @@ About 60 s in all on two cores: each kill costs the start of a process.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -59,15 +59,17 @@ CUT_OFF_AT = {Failpoint.EPISODE_PLAYED}
 """Whoever dies here has played an episode that is nowhere yet: another one plays it again."""
 
 
-def arm(
-    monkeypatch: pytest.MonkeyPatch, flags: Path, points: Sequence[Failpoint], count: int
-) -> None:
+def arm(monkeypatch: pytest.MonkeyPatch, flags: Path, counts: Mapping[Failpoint, int]) -> None:
     """Processes that start from now on are killed at these points, once at each.
 
-    With a count of two, each life gets a little further than the one before.
+    Args:
+        monkeypatch: Sets what they read.
+        flags: Folder for what shows at which of them one was killed.
+        counts: How often a life meets a point up to its end there. With two everywhere, each gets
+            a little further than the one before.
     """
     flags.mkdir(parents=True)
-    armed = ";".join(f"{point}:{count}:{flags / point}" for point in points)
+    armed = ";".join(f"{point}:{count}:{flags / point}" for point, count in counts.items())
     monkeypatch.setenv(FAILPOINT_VARIABLE, armed)
 
 
@@ -84,7 +86,7 @@ def test_runs_killed_at_failpoints_end_with_the_undisturbed_weights_and_lose_not
     runs = {}
     for group, points in GROUPS.items():
         folder = tmp_path / group
-        arm(monkeypatch, folder / "flags", points, count=2)
+        arm(monkeypatch, folder / "flags", dict.fromkeys(points, 2))
         options = ["--actors", 1, "--no-record", "--step-log", folder / "steps.jsonl"]
         runs[group] = start(group, *named, folder / "runs", *options)
     expected = undisturbed_weights(tmp_path / "undisturbed", *SETTINGS)
@@ -108,7 +110,7 @@ def test_a_robot_s_actor_killed_after_it_has_recovered_its_spool_delivers_the_st
     address = wait_for_file(tmp_path / "address", router)
     learner = ["learner", folder, "--preset", "reaching-smoke", "--connect", address]
     owner = start("learner", *learner, "--set", "task.horizon=150", "schedule.iterations=1")
-    arm(monkeypatch, flags, [Failpoint.SPOOL_RECOVERED], count=1)
+    arm(monkeypatch, flags, {Failpoint.SPOOL_RECOVERED: 1})
     actor = ["actor", "--id", "robot", "--connect", address, "--run", "run", "--spool-steps"]
     actor += ["--spool", tmp_path / "spool.sqlite", "--step-log", step_log]
     first = start("actor-1", *actor)

@@ -323,12 +323,30 @@ def run_twice_then_repeat(program):
     return program
 
 
+@pytest.mark.parametrize("path", ["reference", "winograd", "winograd-bf16", "graphs"])
+def test_steps_are_made_from_the_changed_pictures(path: str) -> None:
+    """As from a memory to which those were added."""
+    compute = Compute(path="reference" if path == "graphs" else path)  # type: ignore[arg-type]
+    changed, inverted = (Trainer(PRESET, compute) for _ in range(2))
+    for trainer in (changed, inverted):
+        if path == "graphs":
+            trainer._steps = GraphedSteps(
+                trainer._network, trainer._optimiser, trainer._memory, record=run_twice_then_repeat
+            )
+        add_trajectory(trainer, 0)
+    inverted.memory.ring[:] = 255 - inverted.memory.ring
+    changed.memory.change_pictures(lambda pictures: 255 - pictures)
+    before = changed.weights_bytes()
+    for trainer in (changed, inverted):
+        trainer._steps.run(torch.tensor([[3, 0], [5, 1]]), torch.arange(6.0))
+    assert changed.weights_bytes() == inverted.weights_bytes() != before
+
+
 def test_what_is_taught_is_computed_on_pictures_as_they_are() -> None:
-    plain = Trainer(PRESET)
-    changing = Trainer(replace(PRESET, augmentation=AUGMENTATION))
+    plain, changing = Trainer(PRESET), Trainer(replace(PRESET, augmentation=AUGMENTATION))
     for trainer in (plain, changing):
         add_trajectory(trainer, 0)
-        trainer._memory.change_pictures(torch.zeros_like)
+    changing.memory.change_pictures(torch.zeros_like)
     assert torch.equal(plain._assess().teaching_signals, changing._assess().teaching_signals)
 
 
