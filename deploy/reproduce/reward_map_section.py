@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -23,7 +23,7 @@ from deploy.reproduce.reward_maps import (
     score_map,
     write_scores,
 )
-from deploy.reproduce.runs import FinishedRun, RunPlan
+from deploy.reproduce.runs import FinishedRun, RunKey, RunPlan
 from deploy.reproduce.tables import mean_and_interval, table
 from deploy.reproduce.work_folder import discriminators_file, policy_file
 from deploy.rewards.timeline import draw_timelines, play_greedily, score_steps
@@ -82,7 +82,36 @@ def map_rewards(
     if not finished:
         return []
     grid = pose_grid(finished[0][1].preset)
-    known = read_scores(folder / NUMBERS)
+    mapped, scores = _mapped_and_scored(finished, iterations, grid, work, folder / NUMBERS)
+    write_scores(folder / NUMBERS, scores)
+    lines = list(
+        dict.fromkeys(
+            RewardLine(condition, score.part)
+            for condition, plan in finished
+            for score in scores
+            if score.run == plan.key.name
+        )
+    )
+    _draw_first_seed(folder / MAPS, grid, lines, mapped, scores)
+    draw_scores(folder / MAP_SCORES, lines, scores)
+    sections = [_maps_section(lines, scores, grid), _peaks_section(lines, scores)]
+    with_policy = [run for run in mapped if policy_file(work, run.plan).exists()]
+    if with_policy:  # a run that is to go on has left none yet
+        _draw_timeline(folder, with_policy[0], work)
+    if (folder / TIMELINE).exists():
+        sections.append(_timeline_section(*finished[0]))
+    return sections
+
+
+def _mapped_and_scored(
+    finished: Sequence[tuple[Condition, RunPlan]],
+    iterations: Mapping[RunKey, int],
+    grid: PoseGrid,
+    work: Path,
+    numbers: Path,
+) -> tuple[list[MappedRun], list[MapScore]]:
+    """Maps of the runs that have left their discriminators; scores of all, from the file if not."""
+    known = read_scores(numbers)
     mapped: list[MappedRun] = []
     scores: list[MapScore] = []
     for condition, plan in finished:
@@ -93,32 +122,26 @@ def map_rewards(
             mapped.append(_mapped(condition, plan, last, grid, work))
             its = mapped[-1].scores(grid)
         scores += its
-    write_scores(folder / NUMBERS, scores)
-    lines = list(
-        dict.fromkeys(
-            RewardLine(condition, score.part)
-            for condition, plan in finished
-            for score in scores
-            if score.run == plan.key.name
-        )
-    )
-    first_seed = [it for it in scores if it.seed == scores[0].seed]
+    return mapped, scores
+
+
+def _draw_first_seed(
+    path: Path,
+    grid: PoseGrid,
+    lines: Sequence[RewardLine],
+    mapped: Sequence[MappedRun],
+    scores: Sequence[MapScore],
+) -> None:
+    """Draws the maps of the first seed, if all of them are there; else leaves the picture."""
+    seed = scores[0].seed
     rows = {
         line: [maps[line.part] for maps in run.maps]
         for run in mapped
-        if run.plan.key.seed == scores[0].seed
+        if run.plan.key.seed == seed
         for line in run.lines
     }
     if rows.keys() == set(lines):
-        draw_maps(folder / MAPS, grid, rows, first_seed)
-    draw_scores(folder / MAP_SCORES, lines, scores)
-    sections = [_maps_section(lines, scores, grid), _peaks_section(lines, scores)]
-    with_policy = [run for run in mapped if policy_file(work, run.plan).exists()]
-    if with_policy:  # a run that is to go on has left none yet
-        _draw_timeline(folder, with_policy[0], work)
-    if (folder / TIMELINE).exists():
-        sections.append(_timeline_section(*finished[0]))
-    return sections
+        draw_maps(path, grid, rows, [it for it in scores if it.seed == seed])
 
 
 def _plans(experiment: Experiment) -> list[tuple[Condition, RunPlan]]:
