@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -293,15 +294,17 @@ class Trainer:
 
     def _run_epochs(self, n_epochs: int, teaching_signals: Tensor) -> Tensor:
         epochs = [self._draw_epoch() for _ in range(n_epochs)]
-        if self._preset.augmentation is None:
-            return self._make_steps(torch.cat(epochs), teaching_signals)
+        preset = self._preset.augmentation
+        if preset is None:
+            return self._step_through(torch.cat(epochs), teaching_signals)
+        change = partial(augmented, preset=preset, generator=self._augmenting)
         losses = []
         for epoch in epochs:
-            self._memory.change_pictures(self._augmented)
-            losses.append(self._make_steps(epoch, teaching_signals))
+            self._memory.change_pictures(change)
+            losses.append(self._step_through(epoch, teaching_signals))
         return torch.cat(losses)
 
-    def _make_steps(self, minibatches: Tensor, teaching_signals: Tensor) -> Tensor:
+    def _step_through(self, minibatches: Tensor, teaching_signals: Tensor) -> Tensor:
         self._counters.gradient_steps += len(minibatches)
         losses = []
         for batches in torch.split(minibatches, _STEPS_AT_ONCE):
@@ -309,10 +312,6 @@ class Trainer:
                 losses.append(self._steps.run(batches, teaching_signals))
             self._on_step()
         return torch.cat(losses)
-
-    def _augmented(self, pictures: Tensor) -> Tensor:
-        assert self._preset.augmentation is not None
-        return augmented(pictures, self._preset.augmentation, self._augmenting)
 
     def _draw_epoch(self) -> Tensor:
         n_held, n_samples = self._memory.n_held, len(self._memory)

@@ -74,14 +74,14 @@ _FLIPPING_NOTES = (
     "Demonstrations: five whole episodes of 30 steps, where the source has 100 samples, by the "
     "expert that looks ahead, with mistakes; at least three of the five have succeeded, and their "
     "last states are the targets.",
-    "Adam instead of RMSProp; one target switch after K's 10 epochs. In the first panel what was"
-    " chosen for the third and fourth panel of table 4.5: pictures are turned by up to 30 "
-    "degrees for the discriminators, real and generated alike, the discriminators have spectral "
-    "norm, and the generator minibatches of 16. In the second the same ends after 8 iterations, "
-    "2,400 samples instead of 4,200: policies that flip every time by then do so less often "
-    "later on. That was seen in the first panel, "
-    "hence the other seeds. In the third the two discriminators' rewards are brought to equal "
-    "spread instead. docs/imitation.md has what led there, on seeds that are not reported.",
+    "Adam instead of RMSProp; one target switch after K's 10 epochs. In the first panel what was "
+    "chosen for the third and fourth panel of table 4.5: pictures are turned by up to 30 degrees "
+    "for the discriminators, real and generated alike, the discriminators have spectral norm, and "
+    "the generator minibatches of 16. In the second the same ends after 8 iterations, 2,400 "
+    "samples instead of 4,200: policies that flip every time by then do so less often later on. "
+    "That was seen in the first panel, hence the other seeds. In the third the two discriminators' "
+    "rewards are brought to equal spread instead. docs/imitation.md has what led there, on seeds "
+    "that are not reported.",
 )
 _FLIPPING_SETTINGS = (
     *ADAM,
@@ -137,7 +137,7 @@ _STEADY = (
     "imitation.discriminator.spectral_norm=true",
     "schedule.minibatch_size=16",
 )
-_ENDING = (
+_ENDING_AND_AUGMENTED = (
     *_STEADY,
     "algorithm.ends_at_horizon=true",
     "augmentation.turn_deg=30.0",
@@ -270,7 +270,7 @@ CHAPTER_4: Final = (
         preset="shirt-ch4",
         overrides=_FOLDING_SETTINGS,
         panels=(
-            *_folding_panels("", _ENDING),
+            *_folding_panels("", _ENDING_AND_AUGMENTED),
             *_folding_panels(
                 ", values beyond the horizon, the generator's pictures as they are", _STEADY
             ),

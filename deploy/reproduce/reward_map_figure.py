@@ -116,7 +116,8 @@ def draw_scores(path: Path, lines: Sequence[RewardLine], scores: Sequence[MapSco
         axes.set(xlabel="iteration", ylabel=name)
         axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.3)
-    row[0].legend(fontsize=7)
+    labelled = row[0].get_legend_handles_labels()
+    figure.legend(*labelled, fontsize=7, loc="outside right upper")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
