@@ -6,7 +6,13 @@ from dataclasses import replace
 from typing import Final
 
 from deploy.reproduce.experiment import AttentionFigure, Condition, Experiment, Panel
-from deploy.reproduce.tuning import TUNING_NOTES, tuning_panel
+from deploy.reproduce.tuning import (
+    DECAYS,
+    ETAS,
+    INTERVALS_OF_FULL_REPLAY,
+    TUNING_NOTES,
+    Tuned,
+)
 from learner.steps.compute import TrainingPath
 
 _DPN = ("algorithm.method=dpn", "algorithm.head=plain")
@@ -102,6 +108,14 @@ def _eta_panel(method: Condition) -> Panel:
     return Panel(method.label, conditions, seeds=5)
 
 
+TUNED: Final = (
+    Tuned(DUELING_DPN, ETAS),
+    Tuned(DPN, ETAS),
+    Tuned(DUELING_DQN, DECAYS),
+    Tuned(DQN, DECAYS),
+    Tuned(FULL_REPLAY_DQN, DECAYS, INTERVALS_OF_FULL_REPLAY),
+)
+
 _RELATIVES = (DPN, DUELING_DPN, MUNCHAUSEN, DOUBLE_DQN, DQN, FULL_REPLAY_DQN)
 
 _TWO_EPOCHS = ("schedule.epochs=2", *ADAM)
@@ -176,7 +190,7 @@ CHAPTER_3: Final = (
         published="nothing: the source uses one setting for all methods.",
         preset="reaching-ch3",
         overrides=ADAM,
-        panels=tuple(tuning_panel(method) for method in FOUR),
+        panels=tuple(each.panel() for each in TUNED),
         notes=TUNING_NOTES,
     ),
     Experiment(

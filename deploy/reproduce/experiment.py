@@ -63,6 +63,8 @@ class Panel:
     stored_states: str | None = None
     """Where last policies are scored, too; see `actors.envs.stored_states.read_stored_states`."""
     first_seed: int = 0
+    tries_settings: bool = False
+    """Whether the conditions are settings of one method, of which the best is chosen."""
 
     @property
     def seed_numbers(self) -> range:

@@ -62,9 +62,7 @@ def write_page(
         parts += [
             _panel_settings(panel_runs.panel),
             demonstrated_returns(panel_runs, _task_of(experiment, panel_runs.panel)),
-            _conclusion(panel_runs),
-            _scores_table(experiment, panel_runs),
-            _differences_table(panel_runs),
+            *_comparison(experiment, panel_runs),
             stored_states_section(panel_runs.panel, panel_runs.scores),
         ]
     parts += [
@@ -83,6 +81,20 @@ def _panel_settings(panel: Panel) -> str:
 
 def _task_of(experiment: Experiment, panel: Panel) -> TaskPreset:
     return experiment.preset_of(panel, panel.conditions[0], panel.first_seed).task
+
+
+def _comparison(experiment: Experiment, panel_runs: PanelRuns) -> list[str]:
+    scores = _scores_table(experiment, panel_runs)
+    if panel_runs.panel.tries_settings:
+        return [_choice(panel_runs), scores]
+    return [_conclusion(panel_runs), scores, _differences_table(panel_runs)]
+
+
+def _choice(panel_runs: PanelRuns) -> str:
+    best = panel_runs.best()
+    if best is None:
+        return "Nothing is chosen before all runs are finished."
+    return f"Chosen, since its mean area is the largest: **{best.label}**."
 
 
 def _conclusion(panel_runs: PanelRuns) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from statistics import mean
 
 from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
 from deploy.reproduce.runs import CLONED, FinishedRun, RunKey
@@ -38,6 +39,12 @@ class PanelRuns:
     def last_values(self, condition: Condition) -> dict[int, float]:
         """The measure of the last policy, by seed."""
         return {run.key.seed: getattr(run, self.measure)[-1] for run in self.runs[condition.name]}
+
+    def best(self) -> Condition | None:
+        """The condition with the largest mean area; None while runs of a condition are missing."""
+        if any(len(runs) < self.panel.seeds for runs in self.runs.values()):
+            return None
+        return max(self.panel.conditions, key=lambda it: mean(self.areas(it).values()))
 
     def difference(self, other: Condition) -> PairedDifference | None:
         """The subject minus the other, over the seeds that both have finished.

@@ -79,6 +79,21 @@ def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
     assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
 
 
+def test_of_settings_that_were_tried_the_one_with_the_largest_mean_area_is_chosen(
+    tmp_path: Path,
+) -> None:
+    panel = Panel("settings", (DPN, DQN), seeds=2, tries_settings=True)
+    experiment = replace(SMOKE, panels=(panel,))
+    lasts_well = [run_of(DPN, 0, [1.0, 5.0]), run_of(DPN, 1, [1.0, 5.0])]
+    is_best = [run_of(DQN, 0, [9.0, 2.0]), run_of(DQN, 1, [0.0, 2.0])]
+    draw(experiment, [*lasts_well, *is_best[:1]], tmp_path, "the command")
+    assert "Nothing is chosen before all runs are finished." in (tmp_path / PAGE).read_text()
+    draw(experiment, [*lasts_well, *is_best], tmp_path, "the command")
+    page = (tmp_path / PAGE).read_text()
+    assert "Chosen, since its mean area is the largest: **DQN**." in page
+    assert "tells nothing" not in page  # settings are not compared with each other
+
+
 def test_the_page_says_how_far_above_its_demonstrations_each_is(tmp_path: Path) -> None:
     experiment = replace(SMOKE, panels=(Panel("2 joints", (DPN, DQN), seeds=2),))
     made = [run_of(DPN, seed, [3.0, 4.0 + seed]) for seed in (0, 1)]
