@@ -162,7 +162,7 @@ CHAPTER_3: Final = (
             *_reaching_panels(25, 5),
             *_reaching_panels(50, 5),
         ),
-        measures=("greedy_returns", "relative_bellman_errors"),
+        measures=("greedy_returns", "training_returns", "relative_bellman_errors"),
         mistake_rate=0.5,
         notes=(
             *_TWO_EPOCHS_NOTES,

@@ -23,6 +23,7 @@ from matplotlib.axes import Axes
 _AXIS_LABELS: dict[Measure, str] = {
     "greedy_returns": "return of the greedy policy",
     "greedy_successes": "success at the end",
+    "training_returns": "return while learning",
     "relative_bellman_errors": "Bellman error / std(V)",
 }
 _PANEL_INCHES = (5.2, 3.4)
@@ -119,9 +120,7 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
 
 def _curves(runs: Sequence[FinishedRun], measure: Measure) -> tuple[list[int], np.ndarray]:
     """Where the measure was taken, and its values f64[seeds, points]."""
-    if measure == "relative_bellman_errors":
-        points = [[it for it in run.points if it.iteration > 0] for run in runs]
-        values = [[it.relative_bellman_error for it in each] for each in points]
-        return [it.samples for it in points[0]], np.array(values, np.float64)  # None is nan
-    curves = [getattr(run, measure) for run in runs]
-    return runs[0].samples, np.array(curves, dtype=np.float64)
+    curves = np.array([getattr(run, measure) for run in runs], np.float64)  # None is nan
+    if measure in ("relative_bellman_errors", "training_returns"):
+        return [it.samples for it in runs[0].points if it.iteration > 0], curves
+    return runs[0].samples, curves

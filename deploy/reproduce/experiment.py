@@ -16,7 +16,9 @@ from learner.steps.compute import TrainingPath
 DEMONSTRATOR: Final = "demonstrator"
 """The condition of runs that learn to demonstrate."""
 
-Measure = Literal["greedy_returns", "greedy_successes", "relative_bellman_errors"]
+Measure = Literal[
+    "greedy_returns", "greedy_successes", "training_returns", "relative_bellman_errors"
+]
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from broker_config.preset import TaskPreset
 from deploy.presets import load_preset
 from deploy.reproduce.demonstrated_section import demonstrated_returns, who_demonstrated
-from deploy.reproduce.experiment import Experiment, Measure, Panel
+from deploy.reproduce.experiment import Condition, Experiment, Measure, Panel
 from deploy.reproduce.panel_runs import PanelRuns
 from deploy.reproduce.runs import CLONED, FinishedRun
+from deploy.reproduce.statistics import PairedDifference
 from deploy.reproduce.stored_states_section import stored_states_section
 from deploy.reproduce.tables import (
     DIFFERENCE_HEADER,
@@ -87,7 +89,8 @@ def _comparison(experiment: Experiment, panel_runs: PanelRuns) -> list[str]:
     scores = _scores_table(experiment, panel_runs)
     if panel_runs.panel.tries_settings:
         return [_choice(panel_runs), scores]
-    return [_conclusion(panel_runs), scores, _differences_table(panel_runs)]
+    differences = _differences_table(experiment, panel_runs)
+    return [_conclusion(experiment, panel_runs), scores, differences]
 
 
 def _choice(panel_runs: PanelRuns) -> str:
@@ -97,29 +100,53 @@ def _choice(panel_runs: PanelRuns) -> str:
     return f"Chosen, since its mean area is the largest: **{best.label}**."
 
 
-def _conclusion(panel_runs: PanelRuns) -> str:
-    sentences = []
-    subject = panel_runs.subject.label
-    for other in panel_runs.panel.conditions[1:]:
-        difference = panel_runs.difference(other)
-        if difference is None:
-            continue
-        what = "last policy" if other.start in CLONED else "area under the curve"
-        n_seeds = len(difference.differences)
-        if n_seeds < _LEAST_SEEDS or difference.t is None:
-            sentences.append(
-                f"{subject}'s {what} minus {other.label}'s is {difference.mean:+.2f}, which with "
-                f"seeds as few as {n_seeds} tells nothing yet."
-            )
-            continue
-        low, high = difference.t
-        verdict = "above" if low > 0 else "below" if high < 0 else "not told apart from"
-        sentences.append(
-            f"{subject}'s {what} is {verdict} {other.label}'s: the mean paired difference is "
-            f"{difference.mean:+.2f}, with a 95 % interval from {low:+.2f} to {high:+.2f} "
-            f"(Student's t, {n_seeds} seeds)."
+def _conclusion(experiment: Experiment, panel_runs: PanelRuns) -> str:
+    return "\n".join(
+        _verdict(panel_runs.subject, each) for each in _differences(experiment, panel_runs)
+    )
+
+
+class _Difference(NamedTuple):
+    """The subject minus another condition."""
+
+    other: Condition
+    of_one: str
+    """What is compared: "area"."""
+    of_all: str
+    """The same of many: "areas"."""
+    paired: PairedDifference
+
+
+def _differences(experiment: Experiment, panel_runs: PanelRuns) -> Iterator[_Difference]:
+    others = panel_runs.panel.conditions[1:]
+    for other in others:
+        if (paired := panel_runs.difference(other)) is not None:
+            if other.start in CLONED:
+                yield _Difference(other, "last policy", "last policies", paired)
+            else:
+                yield _Difference(other, "area under the curve", "areas", paired)
+    if "training_returns" in experiment.measures:
+        for other in others:
+            if (paired := panel_runs.training_difference(other)) is not None:
+                of_both = "return while learning"
+                yield _Difference(other, f"mean {of_both}", of_both, paired)
+
+
+def _verdict(subject: Condition, difference: _Difference) -> str:
+    paired, other, what = difference.paired, difference.other, difference.of_one
+    n_seeds = len(paired.differences)
+    if n_seeds < _LEAST_SEEDS or paired.t is None:
+        return (
+            f"{subject.label}'s {what} minus {other.label}'s is {paired.mean:+.2f}, which with "
+            f"seeds as few as {n_seeds} tells nothing yet."
         )
-    return "\n".join(sentences)
+    low, high = paired.t
+    verdict = "above" if low > 0 else "below" if high < 0 else "not told apart from"
+    return (
+        f"{subject.label}'s {what} is {verdict} {other.label}'s: the mean paired difference is "
+        f"{paired.mean:+.2f}, with a 95 % interval from {low:+.2f} to {high:+.2f} "
+        f"(Student's t, {n_seeds} seeds)."
+    )
 
 
 def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
@@ -153,13 +180,12 @@ def _mean(by_seed: Mapping[int, float]) -> float:
     return float(np.mean(list(by_seed.values())))
 
 
-def _differences_table(panel_runs: PanelRuns) -> str:
-    rows = []
-    for other in panel_runs.panel.conditions[1:]:
-        if (difference := panel_runs.difference(other)) is not None:
-            what = ", last policies" if other.start in CLONED else ", areas"
-            label = f"{panel_runs.subject.label} - {other.label}{what}"
-            rows.append(difference_row(label, difference))
+def _differences_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
+    subject = panel_runs.subject.label
+    rows = [
+        difference_row(f"{subject} - {it.other.label}, {it.of_all}", it.paired)
+        for it in _differences(experiment, panel_runs)
+    ]
     for condition in panel_runs.panel.conditions:
         if (difference := panel_runs.above_demonstrations(condition)) is not None:
             label = f"{condition.label} - its demonstrations, last return"
@@ -177,6 +203,11 @@ def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
         "numbers are derived from them. All runs are shown.",
         *(f"* {note}" for note in experiment.notes),
     ]
+    if "training_returns" in experiment.measures:
+        lines.append(
+            "* The return while learning is that of the episodes that a method plays to learn from "
+            "them, sampled from its policy, or epsilon-greedy; its mean is over all of them."
+        )
     if changes := [f"`{it}`" for it in (*experiment.overrides, *experiment.changes)]:
         lines.append(f"* Changed from the preset: {', '.join(changes)}.")
     return "\n".join([*lines, *who_demonstrated(panels)])

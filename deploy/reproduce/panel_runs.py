@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import mean
 
@@ -52,11 +52,21 @@ class PanelRuns:
         Areas are compared; with what was cloned, which has no curve, the last policies.
         """
         values = self.last_values if other.start in CLONED else self.areas
-        mine, theirs = values(self.subject), values(other)
-        seeds = sorted(mine.keys() & theirs.keys())
-        if not seeds:
-            return None
-        return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
+        return _paired(values(self.subject), values(other))
+
+    def training_difference(self, other: Condition) -> PairedDifference | None:
+        """The same of the mean return of all that was played to learn; None if one played nothing.
+
+        What a learner's exploration costs counts here, and does not in `difference`.
+        """
+        return _paired(self._training_means(self.subject), self._training_means(other))
+
+    def _training_means(self, condition: Condition) -> dict[int, float]:
+        return {
+            run.key.seed: mean(run.training_returns)
+            for run in self.runs[condition.name]
+            if run.training_returns
+        }
 
     def demonstrated_returns(self) -> dict[int, float]:
         """Mean return of what was demonstrated to the runs, by seed."""
@@ -78,6 +88,14 @@ class PanelRuns:
         if not pairs:
             return None
         return paired_difference([its for its, _ in pairs], [theirs for _, theirs in pairs])
+
+
+def _paired(mine: Mapping[int, float], theirs: Mapping[int, float]) -> PairedDifference | None:
+    """Over the seeds that both have."""
+    seeds = sorted(mine.keys() & theirs.keys())
+    if not seeds:
+        return None
+    return paired_difference([mine[it] for it in seeds], [theirs[it] for it in seeds])
 
 
 def sort_runs(

@@ -118,6 +118,17 @@ class FinishedRun:
         return [value for point in self.points for value in point.greedy_successes]
 
     @property
+    def training_returns(self) -> list[float]:
+        """Mean of the episodes of each iteration, as they were played to learn from them."""
+        own = [point.training_return for point in self.points if point.iteration > 0]
+        return [value for value in own if value is not None]
+
+    @property
+    def relative_bellman_errors(self) -> list[float | None]:
+        """Of the update that ends each iteration; None where it has diverged."""
+        return [point.relative_bellman_error for point in self.points if point.iteration > 0]
+
+    @property
     def demonstrated_return(self) -> float | None:
         """Mean of what was demonstrated to it in whole episodes; None if nothing was."""
         first = self.points[0]

@@ -79,6 +79,23 @@ def test_the_page_states_the_paired_difference(tmp_path: Path) -> None:
     assert "| DPN | 3 | -2.00 | -3.00 to -1.00 | 50% | 50% to 50% | -2.00 | 20 | 5 | 0.1 |" in page
 
 
+def test_what_exploration_costs_counts_in_returns_while_learning_alone(tmp_path: Path) -> None:
+    panel = Panel("2 joints", (DPN, DQN), seeds=4)
+    experiment = replace(SMOKE, panels=(panel,), measures=("greedy_returns", "training_returns"))
+    made = []
+    for seed, cost in enumerate((2.0, 3.0, 4.0)):
+        made.append(run_of(DPN, seed, [0.0, -2.0, -4.0]))
+        as_good = run_of(DQN, seed, [0.0, -2.0, -4.0])
+        explores = [replace(it, training_return=it.training_return - cost) for it in as_good.points]
+        made.append(replace(as_good, points=tuple(explores)))
+    draw(experiment, made, tmp_path, "the command")
+    page = (tmp_path / PAGE).read_text()
+    assert "area under the curve is not told apart from DQN's" in page
+    assert "DPN's mean return while learning is above DQN's: the mean paired difference is" in page
+    assert "| DPN - DQN, areas | +0.00, +0.00, +0.00 |" in page
+    assert "| DPN - DQN, return while learning | +2.00, +3.00, +4.00 | +3.00 |" in page
+
+
 def test_of_settings_that_were_tried_the_one_with_the_largest_mean_area_is_chosen(
     tmp_path: Path,
 ) -> None:
