@@ -233,7 +233,8 @@ CHAPTER_3: Final = (
         overrides=("schedule.epochs=4", *ADAM),
         panels=(Panel("36 actions", _with_and_without_init(), seeds=10),),
         measures=("greedy_returns", "greedy_successes", "training_returns"),
-        episodes=5,
+        episodes=10,
+        scored_after="iteration",
         mistake_rate=0.5,
         notes=(
             "4 epochs instead of the source's 40, and Adam instead of RMSProp.",

@@ -10,7 +10,7 @@ from typing import Final, Literal
 from broker_config.errors import PresetError
 from broker_config.preset import Preset
 from deploy.presets import load_preset
-from deploy.reproduce.runs import RunKey, RunPlan, Start
+from deploy.reproduce.runs import RunKey, RunPlan, ScoredAfter, Start
 from learner.steps.compute import TrainingPath
 
 DEMONSTRATOR: Final = "demonstrator"
@@ -90,7 +90,8 @@ class Experiment:
     measures: tuple[Measure, ...] = ("greedy_returns",)
     """Each is a row of the figure; areas are taken under the first, which is a greedy one."""
     episodes: int = 1
-    """Of the greedy policy after each update; 1 is exact where task and start are deterministic."""
+    """Of the greedy policy for a score; 1 is exact where task and start are deterministic."""
+    scored_after: ScoredAfter = "update"
     mistake_rate: float = 0.0
     """Share of the demonstrator's actions that are random."""
     notes: tuple[str, ...] = ()
@@ -131,6 +132,7 @@ class Experiment:
             self._mistake_rate_of(panel) if by_script else None,
             self.episodes,
             None if demonstrator is None else demonstrator.key.name,
+            self.scored_after,
         )
         return RunPlan(key, preset, condition.path, demonstrator)
 
@@ -150,7 +152,15 @@ class Experiment:
         )
         learned = load_preset(self.preset_name(panel), (*made, *its_own, f"seed={seed}"))
         preset = dataclasses.replace(learned, imitation=None, initialisation=None)
-        key = RunKey(DEMONSTRATOR, seed, preset.digest, "untrained", None, self.episodes)
+        key = RunKey(
+            DEMONSTRATOR,
+            seed,
+            preset.digest,
+            "untrained",
+            None,
+            self.episodes,
+            scored_after=self.scored_after,
+        )
         return RunPlan(key, preset)
 
     def _mistake_rate_of(self, panel: Panel) -> float:

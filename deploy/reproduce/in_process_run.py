@@ -1,4 +1,4 @@
-"""One run in one process: collect, update, and the greedy policy's score after each update."""
+"""One run in one process: collect, update, and score the greedy policy."""
 
 from __future__ import annotations
 
@@ -170,11 +170,12 @@ class InProcessRun(Closing):
         began_secs = time.perf_counter()
         schedule, n_before = self._preset.schedule, self.points[-1].iteration
         first = n_before * schedule.episodes_per_iteration
+        last = first + schedule.episodes_per_iteration - 1
         returns: list[float] = []
         updated_at: list[int] = []
         scores: list[tuple[float, float]] = []
         report: UpdateReport | None = None
-        for index in range(first, first + schedule.episodes_per_iteration):
+        for index in range(first, last + 1):
             acting = collecting_policy(self._preset.algorithm, self._current_policy())
             played = self._collect(acting, index)
             self._add(played)
@@ -185,8 +186,9 @@ class InProcessRun(Closing):
                     self._keep_discriminators(n_before + 1)
                 report = self._trainer.update()
                 self._policy = None
-                updated_at.append((index + 1) * self._preset.task.horizon)
-                scores.append(self._score())
+                if self._plan.key.scored_after == "update" or index == last:
+                    updated_at.append((index + 1) * self._preset.task.horizon)
+                    scores.append(self._score())
         assert report is not None  # an update ends every iteration
         return CurvePoint(
             iteration=n_before + 1,

@@ -197,7 +197,7 @@ def _settings(experiment: Experiment, panels: Sequence[PanelRuns]) -> str:
     lines = [
         *_preset_lines(experiment, panels),
         f"* The area is the mean {_AREA_OF[experiment.measures[0]]} over the samples, by trapezia "
-        "from the first point to the last. Greedy episodes after each update: "
+        f"from the first point to the last. Greedy episodes after each {experiment.scored_after}: "
         f"{experiment.episodes}.",
         "* Seeds are paired: initial weights, minibatches, demonstrations and the episodes' random "
         "numbers are derived from them. All runs are shown.",

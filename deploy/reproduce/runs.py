@@ -22,6 +22,9 @@ Start = Literal["untrained", "initialised", "cloned", "cloned-augmented", "pretr
 learning of demonstrations, of their pictures as they are or changed as discriminators see them. A
 run that is cloned learns nothing more; one that is pretrained imitates from there."""
 
+ScoredAfter = Literal["update", "iteration"]
+"""When the greedy policy plays: after each update, or after the last one of an iteration."""
+
 CLONED: Final[tuple[Start, ...]] = ("cloned", "cloned-augmented")
 
 
@@ -37,9 +40,10 @@ class RunKey:
     mistake_rate: float | None
     """Of the script, where it demonstrates."""
     episodes: int
-    """Of the greedy policy after each update."""
+    """Of the greedy policy for a score."""
     demonstrator: str | None = added(None)
     """Name of the run whose last policy demonstrates, where one does."""
+    scored_after: ScoredAfter = added("update")
 
     @property
     def name(self) -> str:
@@ -73,7 +77,7 @@ class CurvePoint:
     """Of the run; demonstrations are not counted."""
     gradient_steps: int
     updated_at: tuple[int, ...]
-    """Samples of the run at each update of the iteration."""
+    """Samples of the run at each update of the iteration that was scored."""
     greedy_returns: tuple[float, ...]
     """Mean return of the greedy policy's episodes after each of these updates, no discount."""
     greedy_successes: tuple[float, ...]
@@ -104,17 +108,17 @@ class FinishedRun:
 
     @property
     def samples(self) -> list[int]:
-        """Samples at each update."""
+        """Samples at each score."""
         return [samples for point in self.points for samples in point.updated_at]
 
     @property
     def greedy_returns(self) -> list[float]:
-        """Of the policy after each update."""
+        """Of the policy at each score."""
         return [value for point in self.points for value in point.greedy_returns]
 
     @property
     def greedy_successes(self) -> list[float]:
-        """Of the policy after each update."""
+        """Of the policy at each score."""
         return [value for point in self.points for value in point.greedy_successes]
 
     @property

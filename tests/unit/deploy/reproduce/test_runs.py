@@ -71,6 +71,26 @@ def test_what_is_finished_is_not_run_again_and_goes_on_when_more_is_asked_for(
     assert not (tmp_path / "nowhere" / "checkpoints").exists()
 
 
+def test_a_run_that_is_scored_once_an_iteration_learns_the_same(tmp_path: Path) -> None:
+    often, seldom = (
+        replace(SMOKE, scored_after=each).plan(SMOKE.panels[0], DPN, 0)
+        for each in ("update", "iteration")
+    )
+    assert often.key.name != seldom.key.name
+    points = []
+    for plan in (often, seldom):
+        with InProcessRun(plan, tmp_path) as run:
+            points.append(without_time(list(run.finish())))
+    for one_of_many, alone in zip(*points, strict=True):
+        assert alone == replace(
+            one_of_many,
+            updated_at=one_of_many.updated_at[-1:],
+            greedy_returns=one_of_many.greedy_returns[-1:],
+            greedy_successes=one_of_many.greedy_successes[-1:],
+        )
+    assert len(points[0][-1].updated_at) > 1
+
+
 def test_conditions_get_equal_samples_and_gradient_steps(tmp_path: Path) -> None:
     budgets = set()
     for condition in (DPN, DQN, DUELING_DPN):
