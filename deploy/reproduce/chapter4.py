@@ -46,9 +46,9 @@ _FOLDING_NOTES = (
     "Garments begin as at the hard difficulty, within 3 cm and 0.5 rad of their place, as a person "
     "spreads them; the source does not say how. Stored states were made at the medium one, and are "
     "another matter still: turned by 20 to 40 degrees, 4 to 6 cm off, or creased.",
-    "Demonstrations: five episodes of the script with mistakes, at rates that `clothbus collect "
-    "--quality 0.5` finds (half of the episodes fail); at least three of the five have succeeded, "
-    "and their last states are the targets.",
+    "Demonstrations: five episodes of the script with mistakes, at rates that `clothbus demos "
+    "make --quality 0.5` finds (half of the episodes fail); at least three of the five have "
+    "succeeded, and their last states are the targets.",
     "Adam instead of RMSProp; one target switch after K's 20 epochs, which is the other reading of "
     "algorithm 4. In the first four panels pictures are turned by up to 30 degrees for the "
     "discriminators, real and generated alike, since folded is folded wherever it lies; the "

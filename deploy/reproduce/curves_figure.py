@@ -98,7 +98,7 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
         demonstrated += [its for run in runs if (its := run.demonstrated_return) is not None]
         samples, curves = _curves(runs, measure)
         if not samples:
-            continue  # what was cloned has no value function
+            continue  # what was cloned has neither played to learn nor a value function
         middle = interquartile_mean(curves)
         low, high = bootstrap_band(curves)
         n_diverged = int((~np.isfinite(curves)).any(axis=1).sum())
@@ -111,7 +111,7 @@ def _draw_panel(axes: Axes, panel_runs: PanelRuns, measure: Measure) -> None:
         style = "--" if condition.start == "initialised" else "-"
         axes.plot(samples, middle, style, color=condition.colour, label=label, linewidth=1.5)
         axes.fill_between(samples, low, high, color=condition.colour, alpha=0.15, linewidth=0)
-    if measure == "greedy_returns" and demonstrated:
+    if measure in ("greedy_returns", "training_returns") and demonstrated:
         axes.axhline(
             float(np.mean(demonstrated)), color="purple", linestyle="-.", linewidth=1,
             label="demonstrations",

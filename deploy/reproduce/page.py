@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -167,17 +167,13 @@ def _scores_table(experiment: Experiment, panel_runs: PanelRuns) -> str:
         secs = np.median([[point.secs for point in run.points] for run in runs], axis=0)
         last = runs[0].points[-1]
         cells += [
-            "" if condition.start in CLONED else f"{_mean(panel_runs.areas(condition)):.2f}",
+            "" if condition.start in CLONED else f"{panel_runs.mean_area(condition):.2f}",
             str(last.samples),
             str(last.gradient_steps),
             f"{secs.sum() / 60:.1f}",
         ]
         rows.append(cells)
     return table(header, rows)
-
-
-def _mean(by_seed: Mapping[int, float]) -> float:
-    return float(np.mean(list(by_seed.values())))
 
 
 def _differences_table(experiment: Experiment, panel_runs: PanelRuns) -> str:

@@ -36,6 +36,10 @@ class PanelRuns:
             for run in self.runs[condition.name]
         }
 
+    def mean_area(self, condition: Condition) -> float:
+        """Over the seeds."""
+        return mean(self.areas(condition).values())
+
     def last_values(self, condition: Condition) -> dict[int, float]:
         """The measure of the last policy, by seed."""
         return {run.key.seed: getattr(run, self.measure)[-1] for run in self.runs[condition.name]}
@@ -44,7 +48,7 @@ class PanelRuns:
         """The condition with the largest mean area; None while runs of a condition are missing."""
         if any(len(runs) < self.panel.seeds for runs in self.runs.values()):
             return None
-        return max(self.panel.conditions, key=lambda it: mean(self.areas(it).values()))
+        return max(self.panel.conditions, key=self.mean_area)
 
     def difference(self, other: Condition) -> PairedDifference | None:
         """The subject minus the other, over the seeds that both have finished.
@@ -62,11 +66,11 @@ class PanelRuns:
         return _paired(self._training_means(self.subject), self._training_means(other))
 
     def _training_means(self, condition: Condition) -> dict[int, float]:
-        return {
-            run.key.seed: mean(run.training_returns)
+        by_seed = {
+            run.key.seed: [value for value in run.training_returns if value is not None]
             for run in self.runs[condition.name]
-            if run.training_returns
         }
+        return {seed: mean(returns) for seed, returns in by_seed.items() if returns}
 
     def demonstrated_returns(self) -> dict[int, float]:
         """Mean return of what was demonstrated to the runs, by seed."""

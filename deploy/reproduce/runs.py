@@ -122,10 +122,9 @@ class FinishedRun:
         return [value for point in self.points for value in point.greedy_successes]
 
     @property
-    def training_returns(self) -> list[float]:
+    def training_returns(self) -> list[float | None]:
         """Mean of the episodes of each iteration, as they were played to learn from them."""
-        own = [point.training_return for point in self.points if point.iteration > 0]
-        return [value for value in own if value is not None]
+        return [point.training_return for point in self.points if point.iteration > 0]
 
     @property
     def relative_bellman_errors(self) -> list[float | None]:

@@ -83,10 +83,13 @@ def test_what_exploration_costs_counts_in_returns_while_learning_alone(tmp_path:
     panel = Panel("2 joints", (DPN, DQN), seeds=4)
     experiment = replace(SMOKE, panels=(panel,), measures=("greedy_returns", "training_returns"))
     made = []
-    for seed, cost in enumerate((2.0, 3.0, 4.0)):
+    for seed, costs in enumerate(((9.0, 3.0, 1.0), (9.0, 5.0, 1.0), (9.0, 7.0, 1.0))):
         made.append(run_of(DPN, seed, [0.0, -2.0, -4.0]))
         as_good = run_of(DQN, seed, [0.0, -2.0, -4.0])
-        explores = [replace(it, training_return=it.training_return - cost) for it in as_good.points]
+        explores = [
+            replace(point, training_return=point.training_return - cost)
+            for point, cost in zip(as_good.points, costs, strict=True)
+        ]
         made.append(replace(as_good, points=tuple(explores)))
     draw(experiment, made, tmp_path, "the command")
     page = (tmp_path / PAGE).read_text()
@@ -101,11 +104,11 @@ def test_of_settings_that_were_tried_the_one_with_the_largest_mean_area_is_chose
 ) -> None:
     panel = Panel("settings", (DPN, DQN), seeds=2, tries_settings=True)
     experiment = replace(SMOKE, panels=(panel,))
-    lasts_well = [run_of(DPN, 0, [1.0, 5.0]), run_of(DPN, 1, [1.0, 5.0])]
-    is_best = [run_of(DQN, 0, [9.0, 2.0]), run_of(DQN, 1, [0.0, 2.0])]
-    draw(experiment, [*lasts_well, *is_best[:1]], tmp_path, "the command")
+    was_lucky = [run_of(DPN, 0, [3.0, 9.0]), run_of(DPN, 1, [-3.0, 2.0])]  # 6.0 and -0.5
+    is_best = [run_of(DQN, 0, [6.0, 1.0]), run_of(DQN, 1, [6.0, 1.0])]  # 3.5 and 3.5
+    draw(experiment, [*was_lucky, *is_best[:1]], tmp_path, "the command")
     assert "Nothing is chosen before all runs are finished." in (tmp_path / PAGE).read_text()
-    draw(experiment, [*lasts_well, *is_best], tmp_path, "the command")
+    draw(experiment, [*was_lucky, *is_best], tmp_path, "the command")
     page = (tmp_path / PAGE).read_text()
     assert "Chosen, since its mean area is the largest: **DQN**." in page
     assert "tells nothing" not in page  # settings are not compared with each other
