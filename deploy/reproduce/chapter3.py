@@ -170,7 +170,7 @@ CHAPTER_3: Final = (
         mistake_rate=0.5,
         notes=(
             *_TWO_EPOCHS_NOTES,
-            "The third row is figure 3.7: the Bellman error (eq. 3.6) over std(V).",
+            "Figure 3.7 is what is drawn as Bellman error (eq. 3.6) over std(V).",
             "The relatives are not the source's, which compares with DQN and Dueling DQN alone. "
             "Full replay: one epoch over all samples so far, in all 1.4 times as many gradient "
             "steps as two epochs over the newest 450.",
@@ -180,8 +180,8 @@ CHAPTER_3: Final = (
         name="figure-3.6",
         title="Figure 3.6: the inverse temperature eta",
         source="figure 3.6",
-        published="Larger eta learns faster in [0.01, 3]; a very large one diverges; Dueling DPN "
-        "is more stable over eta.",
+        published="Larger eta learns faster in [0.01, 0.3] (3.0 may be meant), a very large one "
+        "diverges, and Dueling DPN is more stable over eta.",
         preset="reaching-ch3",
         overrides=_TWO_EPOCHS,
         panels=(_eta_panel(DPN), _eta_panel(DUELING_DPN)),

@@ -73,6 +73,10 @@ def test_each_method_has_the_same_budget_on_seeds_that_are_not_reported() -> Non
         for it in tuning.panels
     ]
     assert [len(runs) for runs in tried] == [16] * 5
+    for panel in tuning.panels:
+        presets = (tuning.preset_of(panel, it, panel.first_seed) for it in panel.conditions)
+        schedules = (preset.schedule for preset in presets)
+        assert len({each.target_switches * each.epochs for each in schedules}) == 1, panel.title
     reported = {seed for panel in EXPERIMENTS["figure-3.5"].panels for seed in panel.seed_numbers}
     assert not reported & {seed for panel in tuning.panels for seed in panel.seed_numbers}
 
